@@ -104,8 +104,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 @app.callback(invoke_without_command=True)
 def root(
-    context: typer.Context,
-    show_version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    context: typer.Context, show_version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False
 ) -> None:
     """Options that go before any command; without one, the help."""
     if show_version:

@@ -28,9 +28,7 @@ SCENE = Path(__file__).with_suffix(".toml")
 ROOT = SCENE.parents[1]
 PACKAGES = ("measure", "adjust", "pipeline", "synthetic_images")
 POOLS = ("archive.measure_archive", "archive.new_project", "resampling.resample_stage")
-CERTIFICATE = (
-    "calibrated_principal_distance_mm = 153.0\nangle_deg = [7.5, 15.0, 22.7, 30.0]\nradial_um = [1, 2, 1, -3]\n"
-)
+CERTIFICATE = "calibrated_principal_distance_mm = 153\nangle_deg = [7.5, 15.0, 22.7, 30.0]\nradial_um = [1, 2, 1, -3]\n"
 
 
 def chessboard(number: int, columns: int = 5, rows: int = 4) -> Any:
@@ -50,7 +48,7 @@ def calls(folder: Path) -> Iterator[tuple[str, Sequence[str | Path]]]:
     project, adjustment = small / "project.toml", out / "adjustment.json"
     yield "", ("render", SCENE, small)
     other_font = folder / "font.toml"
-    other_font.write_text(SCENE.read_text(encoding="utf-8").replace("handwriting", "DejaVu Sans"), encoding="utf-8")
+    other_font.write_text(SCENE.read_text().replace("handwriting", "DejaVu Sans"))
     yield "fonts", ("render", other_font, folder / "font")
     for kind in ("project", "camera", "scene"):
         yield "", ("template", kind)
@@ -70,7 +68,7 @@ def calls(folder: Path) -> Iterator[tuple[str, Sequence[str | Path]]]:
         yield "review", ("review", project, "--no-browser")
     yield "", ("resample", project, folder / "resampled", "--lens")
     yield "blocks", ("block", project, folder / "block")
-    project.write_text(project.read_text(encoding="utf-8").replace("[object]", '[object]\ncrs = "EPSG:32633"'))
+    project.write_text(project.read_text().replace("[object]", '[object]\ncrs = "EPSG:32633"'))
     for format in FORMATS:
         yield {"parquet": "parquet", "colmap": "blocks"}.get(format, ""), ("export", project, format, folder / format)
     exported = {
@@ -83,7 +81,7 @@ def calls(folder: Path) -> Iterator[tuple[str, Sequence[str | Path]]]:
     for format, files in exported.items():
         extra = "blocks" if format == "colmap" else ""
         yield extra, ("import", format, *files, folder / f"from-{format}", "--pitch-um", "40")
-    (folder / "certificate.toml").write_text(CERTIFICATE, encoding="utf-8")
+    (folder / "certificate.toml").write_text(CERTIFICATE)
     yield "", ("import", "certificate", folder / "certificate.toml", folder / "from-certificate")
     yield "", ("demo", folder / "demo")
     yield "", ("choose", folder / "demo" / "project.toml")
@@ -128,7 +126,7 @@ def main(folder: Path) -> None:
     """Print it. To be quick, scans are measured in this process, the demonstration is the first frame of the scene, and
     the camera library has two cameras."""
     first_frame = folder / "demo.toml"
-    first_frame.write_text("[[image]]".join(SCENE.read_text(encoding="utf-8").split("[[image]]")[:2]), encoding="utf-8")
+    first_frame.write_text("[[image]]".join(SCENE.read_text().split("[[image]]")[:2]))
     cameras = dict(list(read_library().items())[:2])
     with ExitStack() as stack:
         for module in POOLS:

@@ -42,9 +42,7 @@ def places() -> NDArray[np.float64]:
 @needs_kernels
 @pytest.mark.parametrize("degree", [3, 5])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_a_compiled_spline_is_that_of_scipy(
-    degree: Degree, dtype: type[np.uint8] | type[np.uint16], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_splines(degree: Degree, dtype: type[np.uint8] | type[np.uint16], monkeypatch: pytest.MonkeyPatch) -> None:
     samples, clamped = spline_samples(picture(dtype), places(), degree, dtype)
     monkeypatch.setattr(compiled, "kernels", None)
     expected, by_scipy = spline_samples(picture(dtype), places(), degree, dtype)
@@ -77,9 +75,7 @@ def test_buffers_of_other_sizes_are_refused() -> None:
 
 
 @pytest.mark.parametrize("there", [True, False])
-def test_the_version_says_whether_loops_are_compiled(
-    there: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_version(there: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(compiled, "kernels", object() if there else None)
     assert run(["--version"]) == DONE
     assert ("with compiled loops" if there else "without compiled loops") in capsys.readouterr().out
@@ -143,9 +139,7 @@ def test_compiled_elimination_is_that_of_numpy(seed: int, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("loops", [pytest.param("compiled", marks=needs_kernels), "numpy"])
-def test_own_columns_are_orthonormal_even_if_they_are_nearly_parallel(
-    loops: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_own_columns_are_orthonormal_even_if_nearly_parallel(loops: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if loops == "numpy":
         monkeypatch.setattr(compiled, "kernels", None)
     rows = sparse_rows(1)

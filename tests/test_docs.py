@@ -1,19 +1,23 @@
 """The pages of docs/ that speak of the code: what they name exists, and what they quote is what the program says."""
 
+import json
 import os
 import re
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 from loaded_script import script
+
+import reseau
 
 DOCS = Path(__file__).parents[1] / "docs"
 MKDOCS = DOCS.parent / ".venv-docs" / "bin" / "mkdocs"
 
 
 def test_every_name_in_the_pages_exists() -> None:
-    text = "".join(page.read_text(encoding="utf-8") for page in DOCS.rglob("*.md"))
+    text = "".join(page.read_text() for page in DOCS.rglob("*.md"))
     dotted = r"((?:adjust|pipeline|measure)(?:\.\w+)+)"
     names = {*re.findall(f"`{dotted}`", text), *re.findall(f"^ *{dotted}$", text, flags=re.MULTILINE)}
     assert {"adjust.functional_model.lens", "measure.fiducials.stages"} <= names
@@ -35,13 +39,13 @@ def _exists(name: str) -> bool:
 
 def test_every_link_of_the_pages_leads_somewhere() -> None:
     for page in (*DOCS.rglob("*.md"), *DOCS.parent.glob("*.md")):
-        for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+        for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.relative_to(DOCS.parent)}: {target}"
 
 
 @pytest.mark.study
 def test_the_gallery_quotes_the_program() -> None:
-    page = (DOCS / "failure-gallery.md").read_text(encoding="utf-8")
+    page = (DOCS / "failure-gallery.md").read_text()
     assert leveled(page) == leveled(script(DOCS / "make_gallery.py").text()), "run python docs/make_gallery.py"
 
 
@@ -66,12 +70,12 @@ def test_the_matrices_of_the_figures(name: str, shape: tuple[int, int], filled: 
 
 
 def test_every_module_stands_on_the_map_of_the_code_with_its_own_words() -> None:
-    page = (DOCS / "code.md").read_text(encoding="utf-8")
+    page = (DOCS / "code.md").read_text()
     assert page == script(DOCS / "make_code_map.py").mapped(page), "run python docs/make_code_map.py"
 
 
 def test_the_page_of_keys_is_current() -> None:
-    page = (DOCS / "keys.md").read_text(encoding="utf-8")
+    page = (DOCS / "keys.md").read_text()
     assert page == script(DOCS / "make_keys.py").text(), "run python docs/make_keys.py"
     assert "| `film_sigma_um` | number, 0 or more | µm | 0 |" in page
 
@@ -79,7 +83,7 @@ def test_the_page_of_keys_is_current() -> None:
 def test_what_the_map_of_the_code_says_to_enter_by_exists() -> None:
     """Above the list of a folder's modules: a name with a dot is one of theirs, or a file."""
     named, folder = set(), ""
-    for line in (DOCS / "code.md").read_text(encoding="utf-8").splitlines():
+    for line in (DOCS / "code.md").read_text().splitlines():
         if line.startswith("#"):
             heading = re.match(r"### .*`([\w/]+)/`$", line)
             folder = heading[1].replace("/", ".") if heading else ""
@@ -98,11 +102,46 @@ def test_the_site_is_built_without_a_warning_and_fetches_nothing(tmp_path: Path)
     variables = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
     done = subprocess.run(command, cwd=DOCS.parent, env=variables, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    pages = {
-        page.relative_to(tmp_path).as_posix(): page.read_text(encoding="utf-8") for page in tmp_path.rglob("*.html")
-    }
+    pages = {page.relative_to(tmp_path).as_posix(): page.read_text() for page in tmp_path.rglob("*.html")}
     assert not [
         name for name, text in pages.items() if re.search(r"<(script|link|img)[^>]+(src|href)=\"?https?:", text)
     ]
     assert "measure_fiducials" in pages["reference/python.html"]
     assert "<math" in pages["method/theory.html"]
+
+
+NOTEBOOKS = sorted((Path(__file__).parents[1] / "docs" / "notebooks").glob("*.ipynb"))
+
+
+@pytest.fixture(params=NOTEBOOKS, ids=lambda path: str(path.stem))
+def path(request: pytest.FixtureRequest) -> Path:
+    return Path(request.param)
+
+
+def code_cells(notebook: dict[str, Any]) -> list[dict[str, Any]]:
+    return [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+
+
+def figures(notebook: dict[str, Any]) -> list[bool]:
+    """Of each cell of code, whether it shows a figure."""
+    return [any("image/png" in each.get("data", {}) for each in cell["outputs"]) for cell in code_cells(notebook)]
+
+
+def test_it_is_stored_with_its_plots_and_names_what_there_is(path: Path) -> None:
+    notebook = json.loads(path.read_text())
+    cells = code_cells(notebook)
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    assert sum(figures(notebook)) >= 4
+    code = "\n".join("".join(cell["source"]) for cell in cells)
+    names = set(re.findall(r"\breseau\.(\w+)", code))
+    assert names
+    assert names <= set(dir(reseau))
+    for method in ("plot_residuals", "plot_distortion", "plot_uncertainty", "plot_coverage"):
+        assert f"result.{method}(" in code
+
+
+@pytest.mark.study
+def test_it_runs_to_its_end(path: Path, tmp_path: Path) -> None:
+    made = script(path.parents[1] / "run_notebooks.py").executed(path, tmp_path)
+    assert figures(made) == figures(json.loads(path.read_text()))
+    assert [each for cell in code_cells(made) for each in cell["outputs"] if each["output_type"] == "execute_result"]

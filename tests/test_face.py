@@ -33,15 +33,15 @@ def test_a_file_may_be_named_by_text(read: str, tmp_path: Path) -> None:
 
 
 def test_the_version_is_that_of_the_project() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert f"\nversion: {project['version']}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-    assert f"\n## {project['version']}\n" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert f"\nversion: {project['version']}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f"\n## {project['version']}\n" in (ROOT / "CHANGELOG.md").read_text()
     assert reseau.__version__
 
 
 @pytest.mark.parametrize("arguments", [["-c", "import reseau; reseau.measure_fiducials"], ["-m", "reseau", "--help"]])
 def test_a_file_that_hides_a_package_is_named(tmp_path: Path, arguments: list[str]) -> None:
-    (tmp_path / "measure.py").write_text("x = 1\n", encoding="utf-8")
+    (tmp_path / "measure.py").write_text("x = 1\n")
     variables = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (tmp_path, ROOT)))}
     done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, env=variables, cwd=tmp_path)
     assert done.returncode == 2 if "-m" in arguments else done.returncode
@@ -61,8 +61,7 @@ def test_mypy_sees_types_in_a_script_that_uses_the_wheel(tmp_path: Path) -> None
         "import reseau\n"
         "reveal_type(reseau.__version__)\n"
         "reveal_type(reseau.read_points('points.csv'))\n"
-        "reseau.adjust(5)\n",
-        encoding="utf-8",
+        "reseau.adjust(5)\n"
     )
     variables = {**os.environ, "MYPYPATH": "", "PYTHONPATH": str(tmp_path / "site")}
     mypy = [sys.executable, "-m", "mypy", "--config-file", os.devnull, str(script)]

@@ -34,7 +34,7 @@ FORBIDDEN_LIBRARIES = {"adjust": {"cv2", "skimage", "tifffile", "imagecodecs"}}
 @cache
 def nodes_of_imports(file: Path) -> tuple[ast.Import | ast.ImportFrom | ast.Call, ...]:
     """Import statements and calls of `import_module` of a file, wherever they stand in it."""
-    nodes = ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+    nodes = ast.walk(ast.parse(file.read_text()))
     return tuple(
         node
         for node in nodes
@@ -137,7 +137,7 @@ def rooms_used(room: Path, package: str) -> set[str]:
 
 def test_what_the_packages_import_is_declared_and_what_is_declared_is_imported() -> None:
     """By the distributions that bring the modules: pip installs these."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = (one for name, own in project["optional-dependencies"].items() if name != "dev" for one in own)
     declared = {normal(re.split(r"[\[<>=]", requirement)[0]) for requirement in (*project["dependencies"], *extras)}
     files = [file for package in PACKAGES for file in (ROOT / package).rglob("*.py")]

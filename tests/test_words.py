@@ -71,7 +71,7 @@ def is_text(literal: str) -> bool:
 def literals(folder: str) -> Iterator[tuple[str, str]]:
     """Of the files of a folder, without docstrings; what is put into an f-string as {}."""
     for file in sorted((ROOT / folder).glob("*.py")):
-        nodes = [node for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))) if isinstance(node, KINDS)]
+        nodes = [node for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, KINDS)]
         inside = {id(part) for node in nodes if isinstance(node, ast.JoinedStr) for part in node.values}
         inside |= {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
         for node in nodes:
@@ -93,24 +93,22 @@ def other_files() -> Iterator[tuple[str, str]]:
     for file in sorted((ROOT / "pipeline").rglob("*")):
         where, suffix = str(file.relative_to(ROOT)), file.suffix
         if suffix in (".j2", ".html"):
-            page = re.sub(
-                r"\{#.*?#\}|\{%.*?%\}|<(script|style).*?</\1>", " ", file.read_text(encoding="utf-8"), flags=re.DOTALL
-            )
+            page = re.sub(r"\{#.*?#\}|\{%.*?%\}|<(script|style).*?</\1>", " ", file.read_text(), flags=re.DOTALL)
             page = re.sub(r"\{\{.*?\}\}", "{}", page, flags=re.DOTALL)
             yield from ((where, text) for text in re.findall(r"(?:^|>)([^<>]+)", page))
             yield from ((where, text) for text in re.findall(r'(?:title|alt|placeholder|aria-label)="([^"]+)"', page))
         elif suffix == ".js":
-            script = re.sub(r"^\s*//.*$", "", file.read_text(encoding="utf-8"), flags=re.MULTILINE)
+            script = re.sub(r"^\s*//.*$", "", file.read_text(), flags=re.MULTILINE)
             yield from ((where, text) for _, text in re.findall(r"([\"'`])((?:(?!\1).)*)\1", script))
         elif suffix == ".toml":
-            lines = file.read_text(encoding="utf-8").splitlines()
+            lines = file.read_text().splitlines()
             yield from ((where, line.partition("#")[2]) for line in lines if "#" in line)
 
 
 def pages() -> Iterator[tuple[str, str]]:
     """Paragraphs of the documentation, without code. What the program says in generated pages stands in its own."""
     for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
-        text = page.read_text(encoding="utf-8")
+        text = page.read_text()
         if "generated" in text[:300].lower() or page.name == "code.md":
             continue
         text = re.sub(r"^```.*?^```|`[^`]*`|^    .*$", "", text, flags=re.DOTALL | re.MULTILINE)

@@ -107,11 +107,7 @@ def hash_contents(store: Store, folder: Path, tasks: Sequence[ScanTask], work: W
 
 
 def measure_archive(
-    project: Project,
-    store: Store,
-    learned_folder: Path,
-    reporter: Reporter,
-    options: WorkOptions,
+    project: Project, store: Store, learned_folder: Path, reporter: Reporter, options: WorkOptions
 ) -> Judging | None:
     """Measure the missing scans of a project and check all of them together, unless nothing has changed.
 

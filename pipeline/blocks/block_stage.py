@@ -354,10 +354,7 @@ def coarse_pitch_um(project: Project) -> float | None:
 
 
 def written_block(
-    project: Project,
-    folder: Path,
-    marks: Sequence[ComparatorPoint],
-    poses: dict[str, tuple[Array, Array]],
+    project: Project, folder: Path, marks: Sequence[ComparatorPoint], poses: dict[str, tuple[Array, Array]]
 ) -> Project:
     """Write comparator.csv and images.csv of a block, and return the project that uses them."""
     pitches, given = read_pitches(project.comparator), project.given_images or GivenImages({}, {})

@@ -137,10 +137,7 @@ def _board(sought: SoughtTargets, spec: BoardSpec, scan: Scan, measured: Measure
 
 
 def replace_targets(
-    measured: MeasuredScan,
-    targets: Sequence[MarkMeasurement],
-    problems: Sequence[str] = (),
-    code: Code = Code.UNNAMED,
+    measured: MeasuredScan, targets: Sequence[MarkMeasurement], problems: Sequence[str] = (), code: Code = Code.UNNAMED
 ) -> MeasuredScan:
     """Replace the targets of a scan. code: of the problems."""
     fiducials = [mark for mark in measured.frame.marks if mark.kind in ON_FILM]

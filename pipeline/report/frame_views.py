@@ -253,10 +253,7 @@ def residuals_by_image(data: ReportData) -> dict[str, list[ResidualRecord]]:
 
 
 def _plots(
-    data: ReportData,
-    by_image: dict[str, list[ResidualRecord]],
-    suspects: Collection[ResidualRecord],
-    images: list[str],
+    data: ReportData, by_image: dict[str, list[ResidualRecord]], suspects: Collection[ResidualRecord], images: list[str]
 ) -> dict[str, Markup]:
     stored = data.adjustment
     if stored is None or not by_image:

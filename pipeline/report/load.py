@@ -101,10 +101,7 @@ class _FrameCounts:
 
 
 def reduced(
-    data: ReportData,
-    scans: Iterable[MeasuredScan],
-    image_camera: Callable[[str], str],
-    stored: Judging | None = None,
+    data: ReportData, scans: Iterable[MeasuredScan], image_camera: Callable[[str], str], stored: Judging | None = None
 ) -> ReportData:
     """Reduce the data to the totals of all frames and the worst of the frames that need a look.
 

@@ -84,10 +84,7 @@ class MeasuredScan:
         return cls(scan, 0, 0, (math.nan, math.nan), frame, failure=failure)
 
     def changed(
-        self,
-        marks: Sequence[MarkMeasurement] | None = None,
-        problems: Sequence[Reason] = (),
-        notes: Sequence[str] = (),
+        self, marks: Sequence[MarkMeasurement] | None = None, problems: Sequence[Reason] = (), notes: Sequence[str] = ()
     ) -> "MeasuredScan":
         """Copy with other marks, if given, and further problems and notes."""
         frame = self.frame

@@ -1,9 +1,9 @@
 """A second, dense implementation of the combined model, for comparison: formulas point by point, complex steps only.
 
 It shares nothing with the adjustment but the network and the names of the unknowns. Angles are unknowns themselves, and
-all functions F1 to F9 with their priors stand in one full system.
-"""
+all functions F1 to F9 with their priors stand in one full system."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from adjust import Prior
 from adjust.functional_model.transformation import film_parameter_names
+from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.problem.network import EXTERIOR_NAMES, Network
 
 Array = NDArray[np.float64]
@@ -173,3 +174,9 @@ def _distortion(network: Network, camera: str, x: Values, r: Complex, place: Com
     dx = r[0] * radial + (q["p1"] * (r2 + 2 * ex**2) + 2 * q["p2"] * ex * ey) * growth + affinity
     dy = r[1] * radial + (2 * q["p1"] * ex * ey + q["p2"] * (r2 + 2 * ey**2)) * growth
     return np.array([dx, dy])
+
+
+def row_roots(factor: Factor, blocks: Iterable[Blocks]) -> Iterator[NDArray[np.float64]]:
+    """G (b, m, k) of blocks as these were factorised: G G' are the cofactor matrices of each one's adjusted rows."""
+    for rows in factor.reduced_rows(blocks):
+        yield np.concatenate([rows.own, rows.through @ factor.triangle.group_roots(rows.shared)], axis=2)

@@ -4,33 +4,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from math import pi
 
+import networks as nets
 import numpy as np
-from networks import (
-    CONVERGENT,
-    FREE,
-    HEIGHT,
-    HEIGHTS,
-    KNOWN,
-    LEVEL_STATIONS,
-    STATIONS,
-    TILTED,
-    UNKNOWN,
-    Setup,
-    Triple,
-    Truth,
-    digital_network,
-    field_points,
-    give_values,
-    keep_rows,
-    map_priors,
-    orient,
-    quarters,
-    set_camera,
-    set_images,
-    set_observations,
-    simulated,
-    vertical,
-)
 from numpy.typing import NDArray
 
 from adjust import Adjustment, AdjustmentError, Camera, Distortion, Options, Prior, adjust
@@ -55,13 +30,13 @@ class Failure:
     """A network, what it is in words, the words of its null directions in order, and what mends which of them."""
 
     title: str
-    setup: Setup
+    setup: nets.Setup
     words: tuple[str, ...]
-    mended: Mapping[str, tuple[Setup, tuple[str, ...]]]
+    mended: Mapping[str, tuple[nets.Setup, tuple[str, ...]]]
     options: Options = field(default_factory=lambda: Options(datum="minimal"))
 
 
-def _more(setup: Setup, *attitudes: Triple) -> Setup:
+def _more(setup: nets.Setup, *attitudes: nets.Triple) -> nets.Setup:
     """With further images, taken from stations of their own."""
     further = ((-150.0, -520.0, 1450.0), (350.0, -380.0, 1550.0))[: len(attitudes)]
     return replace(setup, stations=setup.stations + further, attitudes=setup.attitudes + attitudes)
@@ -69,17 +44,17 @@ def _more(setup: Setup, *attitudes: Triple) -> Setup:
 
 TILTS = ((0.3, 0.0, 0.4), (0.0, 0.33, -0.2))  # images tilted in different directions
 
-_flat = Setup(vertical(0.1, 1.6, 3.0, -1.5), relief=0.0)
-_tilted = Setup((TILTED,) * 4, relief=0.0)
-_two = Setup(((0.1, -0.3, 0.2), (-0.05, 0.35, 0.1)), STATIONS[:2], relief=0.0)
-_parallel = Setup(vertical(0.0, 0.0, 0.0, 0.0), sigma=UNKNOWN)
-_half_turned = Setup(vertical(0.0, pi, 0.0, pi), sigma=UNKNOWN)
-_turned = Setup(quarters(), sigma=UNKNOWN)
-_crosswise = Setup(quarters(), LEVEL_STATIONS, relief=0.0, sigma=HEIGHTS)
-_heights_parallel = Setup(vertical(0.0, 0.0, 0.0, 0.0), LEVEL_STATIONS, relief=0.0, sigma=HEIGHTS)
-_heights_relief = Setup(quarters(), sigma=HEIGHTS)
-_plane = Setup(CONVERGENT, relief=0.0, sigma=UNKNOWN)
-_pair = Setup(CONVERGENT[:2], STATIONS[:2], sigma=UNKNOWN)
+_flat = nets.Setup(nets.vertical(0.1, 1.6, 3.0, -1.5), relief=0.0)
+_tilted = nets.Setup((nets.TILTED,) * 4, relief=0.0)
+_two = nets.Setup(((0.1, -0.3, 0.2), (-0.05, 0.35, 0.1)), nets.STATIONS[:2], relief=0.0)
+_parallel = nets.Setup(nets.vertical(0.0, 0.0, 0.0, 0.0), sigma=nets.UNKNOWN)
+_half_turned = nets.Setup(nets.vertical(0.0, pi, 0.0, pi), sigma=nets.UNKNOWN)
+_turned = nets.Setup(nets.quarters(), sigma=nets.UNKNOWN)
+_crosswise = nets.Setup(nets.quarters(), nets.LEVEL_STATIONS, relief=0.0, sigma=nets.HEIGHTS)
+_heights_parallel = nets.Setup(nets.vertical(0.0, 0.0, 0.0, 0.0), nets.LEVEL_STATIONS, relief=0.0, sigma=nets.HEIGHTS)
+_heights_relief = nets.Setup(nets.quarters(), sigma=nets.HEIGHTS)
+_plane = nets.Setup(nets.CONVERGENT, relief=0.0, sigma=nets.UNKNOWN)
+_pair = nets.Setup(nets.CONVERGENT[:2], nets.STATIONS[:2], sigma=nets.UNKNOWN)
 
 CATALOGUE: dict[str, Failure] = {
     "known-flat-vertical": Failure(
@@ -96,7 +71,7 @@ CATALOGUE: dict[str, Failure] = {
         _tilted,
         (*AXES, *DEFORMATIONS, *DISTANCE),
         {
-            QUARTER_TURNS: (replace(_tilted, attitudes=quarters(*TILTED)), DEFORMATIONS + DISTANCE),
+            QUARTER_TURNS: (replace(_tilted, attitudes=nets.quarters(*nets.TILTED)), DEFORMATIONS + DISTANCE),
             OTHER_TILTS: (_more(_tilted, *TILTS), DEFORMATIONS + DISTANCE),
             "points at other heights": (replace(_tilted, relief=200.0), DISTANCE),
         },
@@ -112,20 +87,22 @@ CATALOGUE: dict[str, Failure] = {
     ),
     "known-relief": Failure(
         "Known points, three-dimensional field, even vertical images of one kappa",
-        Setup(vertical(0, 0, 0, 0)),
+        nets.Setup(nets.vertical(0, 0, 0, 0)),
         AXES,
         {},
     ),
-    "unknown-convergent": Failure("Unknown points, convergent images", Setup(CONVERGENT, sigma=UNKNOWN), AXES, {}),
+    "unknown-convergent": Failure(
+        "Unknown points, convergent images", nets.Setup(nets.CONVERGENT, sigma=nets.UNKNOWN), AXES, {}
+    ),
     "unknown-parallel": Failure(
         "Unknown points, parallel axes, equal kappa",
         _parallel,
         (*AXES, *DEFORMATIONS, *POINT, *DISTANCE),
         {
-            HALF_TURNS: (replace(_parallel, attitudes=vertical(0, pi, 0, 0)), POINT),
-            QUARTER_TURNS: (replace(_parallel, attitudes=vertical(0, pi / 2, 0, 0)), DEFORMATIONS),
+            HALF_TURNS: (replace(_parallel, attitudes=nets.vertical(0, pi, 0, 0)), POINT),
+            QUARTER_TURNS: (replace(_parallel, attitudes=nets.vertical(0, pi / 2, 0, 0)), DEFORMATIONS),
             OTHER_TILTS: (_more(_parallel, *TILTS), DEFORMATIONS + POINT + DISTANCE),
-            KNOWN_HEIGHTS: (replace(_parallel, sigma=KNOWN), DEFORMATIONS + POINT + DISTANCE),
+            KNOWN_HEIGHTS: (replace(_parallel, sigma=nets.KNOWN), DEFORMATIONS + POINT + DISTANCE),
         },
     ),
     "unknown-half-turned": Failure(
@@ -133,7 +110,7 @@ CATALOGUE: dict[str, Failure] = {
         _half_turned,
         (*AXES, *DEFORMATIONS, *DISTANCE),
         {
-            QUARTER_TURNS: (replace(_half_turned, attitudes=vertical(0, pi, pi / 2, pi)), DEFORMATIONS),
+            QUARTER_TURNS: (replace(_half_turned, attitudes=nets.vertical(0, pi, pi / 2, pi)), DEFORMATIONS),
             OTHER_TILTS: (_more(_half_turned, *TILTS), DEFORMATIONS + DISTANCE),
         },
     ),
@@ -143,7 +120,7 @@ CATALOGUE: dict[str, Failure] = {
         (*AXES, *DISTANCE),
         {
             OTHER_TILTS: (_more(_turned, *TILTS), DISTANCE),
-            KNOWN_HEIGHTS: (replace(_turned, sigma=KNOWN), DISTANCE),
+            KNOWN_HEIGHTS: (replace(_turned, sigma=nets.KNOWN), DISTANCE),
         },
     ),
     "heights-flat-crosswise": Failure(
@@ -152,7 +129,7 @@ CATALOGUE: dict[str, Failure] = {
         (*AXES, *POINT, *DISTANCE),
         {
             OTHER_TILTS: (_more(_crosswise, *TILTS), POINT + DISTANCE),
-            KNOWN_HEIGHTS: (replace(_crosswise, sigma=KNOWN, relief=200.0), POINT + DISTANCE),
+            KNOWN_HEIGHTS: (replace(_crosswise, sigma=nets.KNOWN, relief=200.0), POINT + DISTANCE),
         },
     ),
     "heights-flat-parallel": Failure(
@@ -160,7 +137,7 @@ CATALOGUE: dict[str, Failure] = {
         _heights_parallel,
         (*AXES, *DEFORMATIONS, *POINT, *DISTANCE),
         {
-            QUARTER_TURNS: (replace(_heights_parallel, attitudes=vertical(0, pi / 2, 0, 0)), DEFORMATIONS),
+            QUARTER_TURNS: (replace(_heights_parallel, attitudes=nets.vertical(0, pi / 2, 0, 0)), DEFORMATIONS),
             OTHER_TILTS: (_more(_heights_parallel, *TILTS), POINT + DISTANCE),
         },
     ),
@@ -170,7 +147,7 @@ CATALOGUE: dict[str, Failure] = {
         (*AXES, *DISTANCE),
         {
             OTHER_TILTS: (_more(_heights_relief, *TILTS), DISTANCE),
-            KNOWN_HEIGHTS: (replace(_heights_relief, sigma=KNOWN), DISTANCE),
+            KNOWN_HEIGHTS: (replace(_heights_relief, sigma=nets.KNOWN), DISTANCE),
         },
     ),
     "unknown-plane": Failure(
@@ -207,53 +184,61 @@ class Mishap:
     options: Options = field(default_factory=Options)
 
 
-_good = Setup(CONVERGENT, prior=1.0, noise=True)
-_near = Setup(
-    ((0.0, 0.0, 0.0), (1e-5, 0.0, 1.5), (0.0, 1e-5, 3.1), (0.0, 0.0, -1.5)), LEVEL_STATIONS, relief=0.02, noise=True
+_good = nets.Setup(nets.CONVERGENT, prior=1.0, noise=True)
+_near = nets.Setup(
+    ((0, 0, 0), (1e-5, 0, 1.5), (0, 1e-5, 3.1), (0, 0, -1.5)), nets.LEVEL_STATIONS, relief=0.02, noise=True
 )
-_all_unknown = replace(_good, sigma=UNKNOWN)
+_all_unknown = replace(_good, sigma=nets.UNKNOWN)
 _line = np.stack([np.linspace(-700.0, 700.0, 9), np.linspace(-300.0, 300.0, 9), np.zeros(9)], axis=1)
-_deformed = Setup(
-    vertical(0.1, 1.6, 3.0, -1.5), relief=20.0, prior=1.0, distortion={"k3": FREE, "k5": FREE}, noise=True
+_deformed = nets.Setup(
+    nets.vertical(0.1, 1.6, 3.0, -1.5), relief=20, prior=1.0, distortion={"k3": nets.FREE, "k5": nets.FREE}, noise=True
 )
 
 
-_narrow = Setup(
-    vertical(0.0, 0.0, 0.0, 0.0),
-    ((0.0, 0.0, HEIGHT), (100.0, 20.0, HEIGHT), (-100.0, 0.0, 1400.0), (20.0, -80.0, 1450.0)),
+_narrow = nets.Setup(
+    nets.vertical(0.0, 0.0, 0.0, 0.0),
+    ((0.0, 0.0, nets.HEIGHT), (100.0, 20.0, nets.HEIGHT), (-100.0, 0.0, 1400.0), (20.0, -80.0, 1450.0)),
     prior=10.0,
     points=np.random.default_rng(4).uniform(-1.0, 1.0, (20, 3)) * [150.0, 150.0, 300.0],
-    distortion={"k3": FREE, "p1": FREE, "p2": FREE},
+    distortion={"k3": nets.FREE, "p1": nets.FREE, "p2": nets.FREE},
     noise=True,
 )
 
 
 def _collinear_stations() -> tuple[Network, Approximations]:
     """All targets of image f3 on a line, those of the others not."""
-    points = np.vstack([field_points(np.random.default_rng(1), 9), _line])
+    points = np.vstack([nets.field_points(np.random.default_rng(1), 9), _line])
     network, start = replace(_good, points=points).network()
-    return keep_rows(network, lambda image, point, kind: image != "f3" or kind != "target" or int(point) >= 9), start
+    return nets.keep_rows(
+        network, lambda image, point, kind: image != "f3" or kind != "target" or int(point) >= 9
+    ), start
 
 
 def _one_ray() -> tuple[Network, Approximations]:
     network, start = _all_unknown.network()
-    return keep_rows(network, lambda image, point, kind: point != "3" or kind == "fiducial" or image == "f1"), start
+    return nets.keep_rows(
+        network, lambda image, point, kind: point != "3" or kind == "fiducial" or image == "f1"
+    ), start
 
 
 def _line_of_sight() -> tuple[Network, Approximations]:
     """Point 0 in line with the two stations that show it."""
-    points = field_points(np.random.default_rng(1), 14)
-    first, second = np.array(STATIONS[0]), np.array([120.0, 40.0, 500.0])
+    points = nets.field_points(np.random.default_rng(1), 14)
+    first, second = np.array(nets.STATIONS[0]), np.array([120.0, 40.0, 500.0])
     points[0] = first + (second - first) * (first[2] - 30.0) / (first[2] - second[2])
-    setup = replace(_all_unknown, points=points, stations=(STATIONS[0], tuple(second), *STATIONS[2:]), noise=False)
-    setup = replace(setup, attitudes=((0.0, 0.0, 0.1), (0.0, 0.0, 1.6), *CONVERGENT[2:]))
+    setup = replace(
+        _all_unknown, points=points, stations=(nets.STATIONS[0], tuple(second), *nets.STATIONS[2:]), noise=False
+    )
+    setup = replace(setup, attitudes=((0.0, 0.0, 0.1), (0.0, 0.0, 1.6), *nets.CONVERGENT[2:]))
     network, start = setup.network()
-    return keep_rows(network, lambda image, point, kind: point != "0" or kind == "fiducial" or image < "f2"), start
+    return nets.keep_rows(network, lambda image, point, kind: point != "0" or kind == "fiducial" or image < "f2"), start
 
 
 def _three_targets() -> tuple[Network, Approximations]:
     network, start = _good.network()
-    return keep_rows(network, lambda image, point, kind: image != "f3" or kind != "target" or int(point) < 3), start
+    return nets.keep_rows(
+        network, lambda image, point, kind: image != "f3" or kind != "target" or int(point) < 3
+    ), start
 
 
 def _swapped() -> tuple[Network, Approximations]:
@@ -264,7 +249,7 @@ def _swapped() -> tuple[Network, Approximations]:
         other.get(point, point) if image == "f1" and kind == "target" else point
         for image, point, kind in zip(rows.image, rows.point, rows.kind, strict=True)
     )
-    return set_observations(network, point=points), start
+    return nets.set_observations(network, point=points), start
 
 
 MISHAPS: dict[str, Mishap] = {
@@ -278,12 +263,12 @@ MISHAPS: dict[str, Mishap] = {
     ),
     "congruent": Mishap(
         "Congruent transformations: one direction less, for the scale is the comparator's",
-        Setup(CONVERGENT, kind="congruent").network,
+        nets.Setup(nets.CONVERGENT, kind="congruent").network,
         ("Shift x", "Shift y", "Rotation"),
     ),
     "projective": Mishap(
         "Projective transformations: the tilts too",
-        Setup(CONVERGENT, kind="projective").network,
+        nets.Setup(nets.CONVERGENT, kind="projective").network,
         ("Shift x", "Shift y", "Rotation", "Scale", "Tilt x", "Tilt y"),
     ),
     "targets-on-a-line": Mishap(
@@ -300,18 +285,20 @@ MISHAPS: dict[str, Mishap] = {
     ),
     "one-station": Mishap(
         "Unknown points, two images from one station",
-        Setup(((0.0, 0.1, 0.0), (0.1, -0.2, 1.0)), ((0.0, 0.0, HEIGHT),) * 2, sigma=UNKNOWN, prior=1.0).network,
+        nets.Setup(
+            ((0.0, 0.1, 0.0), (0.1, -0.2, 1.0)), ((0.0, 0.0, nets.HEIGHT),) * 2, sigma=nets.UNKNOWN, prior=1.0
+        ).network,
         ("were taken from one station",) * 11 + ("The exterior orientation of image",) * 2,
         Options(datum="minimal"),
     ),
     "single-flat": Mishap(
         "One vertical image of a flat field, priors of 1 mm",
-        Setup(vertical(0.1), STATIONS[:1], relief=0.0, prior=1.0, noise=True).network,
+        nets.Setup(nets.vertical(0.1), nets.STATIONS[:1], relief=0.0, prior=1.0, noise=True).network,
         ("The observations say nothing about c, x0 and y0 of camera K", "", "", ""),
     ),
     "nearly-flat": Mishap(
         "Relief of 2 cm under 1500 m, vertical to 0.00001 rad, c and principal point without priors",
-        lambda: (give_values(_near.network()[0], {"x": 1.0, "y": 1.0}), _near.network()[1]),
+        lambda: (nets.give_values(_near.network()[0], {"x": 1.0, "y": 1.0}), _near.network()[1]),
         ("did not stand still", "principal point's x0'", "principal point's y0'", "principal distance of camera K can"),
         Options(iteration_limit=5),
     ),
@@ -351,19 +338,19 @@ def blunder_network(seed: int, oriented: Array | None = None, relief: float = 20
     """Four images of a field of 14 to 30 points known to 5 cm, taken anew for every seed; their orientations, if asked
     for, as they are observed, or roughly where no sigmas are."""
     rng = np.random.default_rng([7, seed])
-    truth = Truth()
+    truth = nets.Truth()
     moved = tuple(tuple(each) for each in np.array(truth.stations) + rng.normal(0.0, 60.0, (4, 3)))
     turns = rng.normal(0.0, [0.05, 0.05, 1.5], (4, 3))
     tilted = tuple(tuple(each) for each in np.array(truth.attitudes) + turns)
     truth = replace(truth, stations=moved, attitudes=tilted, distortion={"k3": 2e-8, "p1": 2e-8})
-    points = field_points(rng, int(rng.integers(14, 31)), relief)
-    made, _ = simulated(rng, truth, points=points, fiducial_sigma=0.01, point_sigma=0.05)
-    made = set_camera(made, principal_distance_mm=Prior(truth.c, 0.0))
+    points = nets.field_points(rng, int(rng.integers(14, 31)), relief)
+    made, _ = nets.simulated(rng, truth, points=points, fiducial_sigma=0.01, point_sigma=0.05)
+    made = nets.set_camera(made, principal_distance_mm=Prior(truth.c, 0.0))
     if oriented is None:
         return made
     errors = np.where(np.isfinite(oriented), oriented, [20.0, 20.0, 20.0, 0.03, 0.03, 0.03])
     exteriors = [Exterior(exterior + errors * rng.normal(size=6), oriented) for exterior in truth.exteriors]
-    return orient(made, {f"f{i}": exterior for i, exterior in enumerate(exteriors)})
+    return nets.orient(made, {f"f{i}": exterior for i, exterior in enumerate(exteriors)})
 
 
 def change_points(given: Network, changed: Callable[[Array], Array], sigma: float = 1.0) -> Network:
@@ -377,7 +364,9 @@ def change_points(given: Network, changed: Callable[[Array], Array], sigma: floa
 
 
 def y_down(given: Network) -> Network:
-    return map_priors(given, lambda name, prior: replace(prior, value=-prior.value) if name.endswith(".y") else prior)
+    return nets.map_priors(
+        given, lambda name, prior: replace(prior, value=-prior.value) if name.endswith(".y") else prior
+    )
 
 
 def other_c(given: Network) -> Network:
@@ -385,7 +374,9 @@ def other_c(given: Network) -> Network:
 
 
 def shift_given(given: Network, name: str, off: float) -> Network:
-    return map_priors(given, lambda each, prior: replace(prior, value=prior.value + off) if each == name else prior)
+    return nets.map_priors(
+        given, lambda each, prior: replace(prior, value=prior.value + off) if each == name else prior
+    )
 
 
 def exchanged(given: Network, with_fiducials: bool = False, frames: str = "13") -> Network:
@@ -394,7 +385,7 @@ def exchanged(given: Network, with_fiducials: bool = False, frames: str = "13") 
     observations = given.observations
     rows = zip(observations.image, observations.kind, strict=True)
     image = tuple(other.get(name, name) if with_fiducials or kind == "target" else name for name, kind in rows)
-    return set_observations(given, image=image)
+    return nets.set_observations(given, image=image)
 
 
 def one_point(given: Network) -> Network:
@@ -405,7 +396,7 @@ def inaccurate_points(given: Network, sigma: float) -> Network:
     """With further errors of the given points' coordinates."""
     rng = np.random.default_rng(len(given.points))
     moved = {f"PT.{point.id}.{axis}": float(rng.normal(0.0, sigma)) for point in given.points for axis in "XYZ"}
-    return map_priors(given, lambda name, prior: replace(prior, value=prior.value + moved.get(name, 0.0)))
+    return nets.map_priors(given, lambda name, prior: replace(prior, value=prior.value + moved.get(name, 0.0)))
 
 
 @dataclass(frozen=True)
@@ -450,7 +441,7 @@ BLUNDERS = {
     ),
     "sheared films held rigid": Blunder(
         None,
-        lambda n: set_images(n, transformation="similarity"),
+        lambda n: nets.set_images(n, transformation="similarity"),
         ("film deformation model, similarity, is too simple",),
     ),
     "standard deviations of the points ten times too small": Blunder(
@@ -615,8 +606,8 @@ def misfit_network(made: Scene, effects: Effects, kind: Misfit, rng: np.random.G
     exterior = _exteriors(made) if kind.stations_given else {}
     rows = [(*name, xy) for name, xy in zip(names, xy_mm, strict=True)]
     points = {f"p{k}": effects.object_unit * xyz for k, xyz in enumerate(made.points)}
-    given_network = digital_network(camera, rows, points, effects.pitch * kind.sigma * SIGMA_MM)
-    return replace(orient(given_network, exterior), disk_radius=kind.disk_radius)
+    given_network = nets.digital_network(camera, rows, points, effects.pitch * kind.sigma * SIGMA_MM)
+    return replace(nets.orient(given_network, exterior), disk_radius=kind.disk_radius)
 
 
 def _exteriors(made: Scene) -> dict[str, Exterior]:
@@ -807,9 +798,7 @@ def draw_network(name: str, seed: int, many: float = MANY) -> Network:
     made = scene(seed, flat)
     rng = np.random.default_rng([37, seed])
     sign = 1.0 if rng.random() < 0.5 else -1.0
-    return misfit_network(
-        made, kind.effect((sign if name != NOISE else 1.0) * _size(name, kind, made, many)), kind, rng
-    )
+    return misfit_network(made, kind.effect((sign if name != NOISE else 1) * _size(name, kind, made, many)), kind, rng)
 
 
 def _size(name: str, kind: Misfit, made: Scene, many: float) -> float:

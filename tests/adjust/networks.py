@@ -390,10 +390,7 @@ class Setup:
 
 
 def set_sigma(point: ObjectPoint, sigma: Triple) -> ObjectPoint:
-    x, y, z = (
-        None if prior is None else replace(prior, sigma=s)
-        for prior, s in zip((point.X, point.Y, point.Z), sigma, strict=True)
-    )
+    x, y, z = (prior and replace(prior, sigma=s) for prior, s in zip((point.X, point.Y, point.Z), sigma, strict=True))
     return replace(point, X=x, Y=y, Z=z)
 
 
@@ -672,7 +669,7 @@ def film_network(
 
 FILM_CAMERA = "K"
 NOMINAL_MM = np.array(
-    [(-106, 106), (106, 106), (106, -106), (-106, -106), (0, 112), (112, 0), (0, -112), (-112, 0)], dtype=np.float64
+    [(-106, 106), (106, 106), (106, -106), (-106, -106), (0, 112), (112, 0), (0, -112), (-112, 0)], float
 )
 FRAME_NOISE_MM = 0.005
 BEND = 1e-2  # mm at 100 mm from the middle: what films of higher order bend
@@ -768,7 +765,7 @@ def _film_kind(name: str) -> str:
 PROJECTED_C_MM, X0_MM, Y0_MM = 152.0, 0.05, -0.03
 PROJECTED_SIGMA_MM = 0.005
 SIX_MARKS_MM = {
-    str(i + 1): 106.0 * np.array(xy) for i, xy in enumerate([(1, -1), (-1, -1), (-1, 1), (1, 1), (-1, 0), (1, 0)])
+    str(i): 106.0 * np.array(xy) for i, xy in enumerate([(1, -1), (-1, -1), (-1, 1), (1, 1), (-1, 0), (1, 0)], 1)
 }
 
 

@@ -46,7 +46,7 @@ Case = dict[str, Any]
 
 def load(name: str) -> Case:
     """A case's file."""
-    case: Case = json.loads((CASES / f"{name}.json").read_text(encoding="utf-8"))
+    case: Case = json.loads((CASES / f"{name}.json").read_text())
     return case
 
 
@@ -96,9 +96,7 @@ def case_approximations(case: Case, values: dict[str, float]) -> Approximations:
     given = case["input"]
     network = case_network(case)
     interior = dict(zip(case["io_names"], given["io_obs"], strict=True))
-    start = {
-        f"PT{i}.{axis}": x for i, row in enumerate(given["pts_obs"], 1) for axis, x in zip("XYZ", row, strict=True)
-    }
+    start = {f"PT{i}.{a}": x for i, xyz in enumerate(given["pts_obs"], 1) for a, x in zip("XYZ", xyz, strict=True)}
     start |= {f"IO.{name}": value for name, value in interior.items()} | values
     return Approximations(
         interior={CAMERA: np.array([start[f"IO.{name}"] for name in ("c", "x0", "y0")])},
@@ -145,9 +143,7 @@ def exact(case: Case) -> Exact:
     network = map_priors(case_network(case), lambda name, prior: replace(prior, value=truth.get(name, prior.value)))
     problem = number(network, start)
     unknowns = problem.unknowns
-    values = np.array(
-        [truth.get(key.text, value) for key, value in zip(unknowns.parameters, unknowns.start, strict=True)]
-    )
+    values = np.array([truth.get(key.text, x) for key, x in zip(unknowns.parameters, unknowns.start, strict=True)])
     problem = replace(problem, unknowns=replace(unknowns, start=values))
     xy_mm = computed_observations(problem, problem.start())
     assert xy_mm is not None

@@ -7,22 +7,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+import networks as nets
 import numpy as np
 import pytest
 from dense_adjustment import solve_densely
-from networks import (
-    Truth,
-    digital_network,
-    field_points,
-    join_networks,
-    join_observations,
-    map_priors,
-    orient,
-    rename_network,
-    set_camera,
-    set_observations,
-    simulated,
-)
 from numpy.typing import NDArray
 from real_data import DATA, needs
 from reference_cases import CAMERA, Case, case_approximations, case_network, load, own_name
@@ -53,9 +41,7 @@ def adjust_network(case: Case, network: Network | None = None) -> Adjustment:
 def differences(case: Case, result: Adjustment) -> np.ndarray:
     """Estimates less the reference's, in the reference's a-priori standard deviations."""
     parameters = case["result"]["parameters"]
-    return np.array(
-        [(result.value(own_name(name)) - row["value"]) / row["std_apriori"] for name, row in parameters.items()]
-    )
+    return np.array([(result.value(own_name(key)) - p["value"]) / p["std_apriori"] for key, p in parameters.items()])
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -68,9 +54,7 @@ def test_reference_case(name: str) -> None:
     counts = (result.conditions, result.unknowns, result.redundancy)
     assert counts == (reference["conditions"], reference["unknowns"], reference["redundancy"])
     assert np.abs(differences(case, result)).max() < 1e-8
-    sigmas = np.array(
-        [np.sqrt(result.cofactor.variances[i]) for i in map(result.index, map(own_name, reference["parameters"]))]
-    )
+    sigmas = np.sqrt([result.cofactor.variances[result.index(own_name(each))] for each in reference["parameters"]])
     expected = np.array([row["std_apriori"] for row in reference["parameters"].values()])
     np.testing.assert_allclose(sigmas, expected, rtol=1e-9)
     if reference["vpv"] > 1e-12:
@@ -116,16 +100,16 @@ def test_an_iteration_limit_is_reported() -> None:
 
 
 def test_a_mark_and_a_picture_under_two_names_are_named() -> None:
-    network, start = simulated(np.random.default_rng(1), Truth())
+    network, start = nets.simulated(np.random.default_rng(1), nets.Truth())
     assert not any("two names" in each for each in adjust(network, start).warnings)
     rows, known = network.observations, network.point_by_id["3"]
     is_target = [kind == "target" for kind in rows.kind]
     own = [row for row, point in enumerate(rows.point) if point == "3" and is_target[row]]
     other = replace(rows.only(np.array(own)), point=("3 again",) * len(own))
     twice = replace(network, points=(*network.points, replace(known, id="3 again")))
-    twice = replace(twice, observations=join_observations(rows, other))
+    twice = replace(twice, observations=nets.join_observations(rows, other))
     assert any("3 again and 3: a mark under two names" in each for each in adjust(twice, start).warnings)
-    copied = join_networks((network, start), rename_network(network, start, "K", str, "{} again".format, str))
+    copied = nets.join_networks((network, start), nets.rename_network(network, start, "K", str, "{} again".format, str))
     assert any("f0 again as f0" in each for each in adjust(*copied).warnings)
 
 
@@ -135,7 +119,7 @@ def test_opencvs_own_calibration_of_the_planar_board() -> None:
     opencv, pixel_mm = case["opencv"], case["pixels"]["pixel_mm"]
     names = ("k1", "k2", "p1", "p2", "k3")
     free = {name: Prior(0.0, np.inf) for name in names}
-    result = adjust_network(case, set_camera(case_network(case), distortion=Distortion("opencv", free)))
+    result = adjust_network(case, nets.set_camera(case_network(case), distortion=Distortion("opencv", free)))
     assert result.converged
 
     half_width, half_height = (case["pixels"]["width"] - 1) / 2, (case["pixels"]["height"] - 1) / 2
@@ -159,45 +143,48 @@ STEEP = ((0.02, -1.55, 0.1), (-0.03, 1.53, 3.1), (-1.6, 0.05, 3.139), (0.02, -0.
 
 def all_free_of_torlegard() -> Variant:
     """Every parameter of the family, the decentering terms as printed, r0, and three kinds of scans."""
-    truth = Truth(decentering="paper", mirrored=(True, False, True, False))
+    truth = nets.Truth(decentering="paper", mirrored=(True, False, True, False))
     free = {"k3": np.inf, "k5": 1e-11, "k7": 1e-15, "p1": np.inf, "p2": 1e-5, "p3": 1e-5, "p4": 1e-9}
     truth = replace(truth, distortion={**truth.distortion, "k7": 1e-17, "p3": 1e-6, "p4": -1e-10})
-    return simulated(np.random.default_rng(1), truth, "affine", point_sigma=0.02, free=free)
+    return nets.simulated(np.random.default_rng(1), truth, "affine", point_sigma=0.02, free=free)
 
 
 def mirrored(kind: Transformation, *free: str) -> Variant:
-    truth = Truth(mirrored=(False, True, True, False))
-    return simulated(np.random.default_rng(3), truth, kind, free=dict.fromkeys(free, np.inf))
+    truth = nets.Truth(mirrored=(False, True, True, False))
+    return nets.simulated(np.random.default_rng(3), truth, kind, free=dict.fromkeys(free, np.inf))
 
 
 def steep_angles() -> Variant:
     """A level camera that looks along +-X (phi near +-90), one upside down (omega beyond 90), kappa past 180."""
     stations = ((-1500.0, 20.0, 30.0), (1500.0, -30.0, 10.0), (40.0, 1500.0, 60.0), (10.0, -20.0, 1500.0))
-    truth, points = Truth(stations=stations, attitudes=STEEP), field_points(np.random.default_rng(4), 12, 700.0)
-    return simulated(np.random.default_rng(4), truth, "affine", points=points)
+    truth, points = (
+        nets.Truth(stations=stations, attitudes=STEEP),
+        nets.field_points(np.random.default_rng(4), 12, 700.0),
+    )
+    return nets.simulated(np.random.default_rng(4), truth, "affine", points=points)
 
 
 def observed_orientations() -> Variant:
     """Every element observed, one image's angles fixed, one with a free element; unknown points."""
-    network, start = simulated(np.random.default_rng(5), point_sigma=np.inf, free={"k3": np.inf})
+    network, start = nets.simulated(np.random.default_rng(5), point_sigma=np.inf, free={"k3": np.inf})
     rng = np.random.default_rng(50)
     exteriors = {}
     for i, values in enumerate(map(np.copy, start.exterior.values())):
         sigmas = np.array([2.0, 2.0, 2.0, 0.01, 0.01, 0.01])
         if i == 1:
             sigmas[3:] = 0.0
-            values[3:] = Truth().attitudes[1]
+            values[3:] = nets.Truth().attitudes[1]
         if i == 2:
             sigmas[[2, 5]] = np.inf
-        values[:3] = Truth().stations[i] + rng.normal(0, 2.0, 3)
+        values[:3] = nets.Truth().stations[i] + rng.normal(0, 2.0, 3)
         values[5] += 2 * np.pi * (i == 3)  # a whole turn more is the same angle
         exteriors[f"f{i}"] = Exterior(values, sigmas)
-    return orient(network, exteriors), start
+    return nets.orient(network, exteriors), start
 
 
 def heights_and_mixtures() -> Variant:
     """Points known, known in height, known in plan, roughly known, unknown."""
-    network, start = simulated(np.random.default_rng(6), free={"k3": np.inf})
+    network, start = nets.simulated(np.random.default_rng(6), free={"k3": np.inf})
     rng = np.random.default_rng(60)
     kinds = [(0, 0, 0), (None, None, 0.01), (0.01, 0.01, None), (0.05, 0.02, 0.1), (None,) * 3]
     points = []
@@ -213,34 +200,34 @@ def heights_and_mixtures() -> Variant:
 
 def two_cameras() -> Variant:
     """A film camera and a digital one with Brown's lens, that share the points; correlated observations."""
-    film, start = simulated(np.random.default_rng(7), free={"k3": np.inf, "p1": np.inf})
-    truth = Truth(c=80.0, x0=0.1, y0=0.2, distortion={"k3": 3e-7})
+    film, start = nets.simulated(np.random.default_rng(7), free={"k3": np.inf, "p1": np.inf})
+    truth = nets.Truth(c=80.0, x0=0.1, y0=0.2, distortion={"k3": 3e-7})
     truth = replace(truth, stations=truth.stations[::-1], attitudes=truth.attitudes[::-1])
     xyz = np.array([start.points[point.id] for point in film.points])
-    other, begin = simulated(np.random.default_rng(70), truth, "none", points=xyz)
+    other, begin = nets.simulated(np.random.default_rng(70), truth, "none", points=xyz)
     lens = Distortion("brown", {"k1": Prior(3e-7, np.inf), "b1": Prior(0.0, 1e-3), "b2": Prior(0.0, np.inf)})
     camera = Camera("D", Prior(80.5, np.inf), Prior(0.0, 1.0), Prior(0.0, 1.0), lens)
     correlated = np.tile(np.array([[1.0, 0.6], [0.6, 1.5]]) * 0.004**2, (len(other.observations), 1, 1))
-    other = set_observations(other, covariance_mm2=correlated)
-    other, begin = rename_network(other, begin, "D", str, "d{}".format, str)
+    other = nets.set_observations(other, covariance_mm2=correlated)
+    other, begin = nets.rename_network(other, begin, "D", str, "d{}".format, str)
     begin = replace(begin, interior={"D": np.array([80.5, 0.0, 0.0])})
-    return join_networks((film, start), (replace(other, cameras=(camera,)), begin))
+    return nets.join_networks((film, start), (replace(other, cameras=(camera,)), begin))
 
 
 def fiducials_fixed_free_and_given() -> Variant:
     """Two marks fixed, one free, the others with priors of their own; a mark that one image shows alone."""
-    network, start = simulated(np.random.default_rng(8), free={"k3": np.inf}, fiducial_sigma=0.002)
+    network, start = nets.simulated(np.random.default_rng(8), free={"k3": np.inf}, fiducial_sigma=0.002)
     marks = dict(network.cameras[0].fiducials)
     for id_, sigma in {"1": 0.0, "2": 0.0, "3": np.inf, "5": 0.01}.items():
         marks[id_] = Fiducial(Prior(marks[id_].x_mm.value, sigma), Prior(marks[id_].y_mm.value, 2 * sigma))
-    return set_camera(network, fiducials=marks), start
+    return nets.set_camera(network, fiducials=marks), start
 
 
 def bent_films(kind: Transformation) -> Variant:
     """Scans far from the comparator's origin, one mirrored."""
-    truth = Truth(middle_mm=(120.0, -115.0), mirrored=(False, True, False, False))
-    points = field_points(np.random.default_rng(7), 12)
-    return simulated(np.random.default_rng(6), truth, kind, points, free={"k3": np.inf})
+    truth = nets.Truth(middle_mm=(120.0, -115.0), mirrored=(False, True, False, False))
+    points = nets.field_points(np.random.default_rng(7), 12)
+    return nets.simulated(np.random.default_rng(6), truth, kind, points, free={"k3": np.inf})
 
 
 VARIANTS = (
@@ -284,10 +271,12 @@ GRID = 2.0**-20  # coordinates that are a multiple of it lose no digit beside FA
 
 def small_network(sigma: float = 0.0) -> tuple[Network, Approximations]:
     """A field of 1.6 m at 1.5 m, whose stations are known to some hundredths of a millimetre."""
-    stations = tuple((0.001 * x, 0.001 * y, 0.001 * z) for x, y, z in Truth().stations)
-    points = GRID * np.round(field_points(np.random.default_rng(2), 20) * 0.001 / GRID)
+    stations = tuple((0.001 * x, 0.001 * y, 0.001 * z) for x, y, z in nets.Truth().stations)
+    points = GRID * np.round(nets.field_points(np.random.default_rng(2), 20) * 0.001 / GRID)
     free = {"k3": np.inf, "k5": np.inf}
-    return simulated(np.random.default_rng(3), Truth(stations=stations), points=points, point_sigma=sigma, free=free)
+    return nets.simulated(
+        np.random.default_rng(3), nets.Truth(stations=stations), points=points, point_sigma=sigma, free=free
+    )
 
 
 def shifted(network: Network, shift: Array) -> Network:
@@ -298,7 +287,7 @@ def shifted(network: Network, shift: Array) -> Network:
             return prior
         return replace(prior, value=GRID * round(prior.value / GRID) + float(shift["XYZ".index(name[-1])]))
 
-    return map_priors(network, moved)
+    return nets.map_priors(network, moved)
 
 
 def sigmas_apart(here: Adjustment, there: Adjustment) -> float:
@@ -350,12 +339,8 @@ def make_network(published: dict[str, Any]) -> Network:
     camera = Camera("camera", None, None, None, Distortion("opencv", free), center_mm=(3.195, -2.395))
     board = published["X_1"].T
     assert all((board == published[f"X_{image}"].T).all() for image in IMAGES)
-    rows = [
-        (image, str(k), xy * [PITCH_MM, -PITCH_MM])
-        for image in IMAGES
-        for k, xy in enumerate(published[f"x_{image}"].T)
-    ]
-    return digital_network(camera, rows, {str(k): xyz for k, xyz in enumerate(board)}, 0.15 * PITCH_MM)
+    rows = [(i, str(k), xy * [PITCH_MM, -PITCH_MM]) for i in IMAGES for k, xy in enumerate(published[f"x_{i}"].T)]
+    return nets.digital_network(camera, rows, {str(k): xyz for k, xyz in enumerate(board)}, 0.15 * PITCH_MM)
 
 
 def pixel_intrinsics(adjustment: Adjustment) -> tuple[Array, Array]:
@@ -411,13 +396,13 @@ def network_of_demo() -> Network:
     free = {name: Prior(0.0, np.inf) for name in ("k1", "k2", "k3", "p1", "p2", "b1")}
     camera = Camera("C4040Z", None, None, None, Distortion("brown", free), center_mm=(3.6265, -2.7188))
     rows = [(row[0], row[1], np.array([float(row[2]), -float(row[3])]) * PIXEL_MM) for row in marks]
-    network = digital_network(camera, rows, known, SIGMA_PX * PIXEL_MM[1])
+    network = nets.digital_network(camera, rows, known, SIGMA_PX * PIXEL_MM[1])
     unknown = sorted({row[1] for row in marks} - known.keys())
     return replace(network, points=(*network.points, *(ObjectPoint(point, None, None, None) for point in unknown)))
 
 
 def table(file: Path) -> list[list[str]]:
-    lines = file.read_text(encoding="utf-8").splitlines()
+    lines = file.read_text().splitlines()
     return [[cell.strip() for cell in line.split(",")] for line in lines if line.strip() and not line.startswith("#")]
 
 

@@ -1,27 +1,20 @@
 """The film transformations: formulas, derivatives, inverses, fits from marks, and networks of every kind."""
 
 from dataclasses import replace
+from itertools import combinations
 
+import networks as nets
 import numpy as np
 import pytest
-from networks import (
-    KINDS,
-    Truth,
-    camera_of_film,
-    field_points,
-    film_parameters,
-    keep_rows,
-    simulated,
-)
+from networks import halves, simulated
 from numpy.typing import NDArray
+from scipy.optimize import approx_fprime
 
-from adjust import AdjustmentError, adjust, approximate
-from adjust.functional_model.transformation import (
-    Film,
-    film_kind,
-    fit_transformation,
-)
-from adjust.problem.network import Image, Network, Transformation
+from adjust import Adjustment, AdjustmentError, Network, Options, Parameter, Prior, adjust, approximate
+from adjust.functional_model.transformation import Film, film_kind, fit_transformation
+from adjust.problem.camera import Fiducial, FiducialDistance
+from adjust.problem.network import Image, Transformation
+from adjust.solution.planning import plan
 
 Array = NDArray[np.float64]
 
@@ -31,14 +24,14 @@ PLACES_MM = MIDDLE_MM + np.random.default_rng(1).uniform(-110.0, 110.0, (6, 2))
 
 
 def make_parameters(kind: Transformation, mirrored: bool) -> Array:
-    return film_parameters(Truth(middle_mm=(120.0, -110.0), mirrored=4 * (mirrored,)), 1, kind)
+    return nets.film_parameters(nets.Truth(middle_mm=(120.0, -110.0), mirrored=4 * (mirrored,)), 1, kind)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", nets.KINDS)
 def test_formulas_derivatives_by_complex_steps_and_inverses(kind: Transformation, mirrored: bool) -> None:
     formula, parameters = film_kind(kind, mirrored), make_parameters(kind, mirrored)
-    expected = np.stack(camera_of_film(kind, parameters, mirrored, *PLACES_MM.T), axis=1)
+    expected = np.stack(nets.camera_of_film(kind, parameters, mirrored, *PLACES_MM.T), axis=1)
     np.testing.assert_allclose(formula.apply(parameters, PLACES_MM), expected, rtol=1e-13)
     film = Film(kind, parameters, MIDDLE_MM, mirrored)
     gradient, design = formula.gradient(parameters, PLACES_MM), film.design(PLACES_MM)
@@ -63,9 +56,7 @@ def test_formulas_derivatives_by_complex_steps_and_inverses(kind: Transformation
         ("affine", [0, 1, 2, 0, 2, 4], [[1, 2]], [False]),
     ],
 )
-def test_what_folds_over_is_not_found(
-    kind: Transformation, parameters: list[float], camera: list[list[float]], found: list[bool]
-) -> None:
+def test_no_folds(kind: Transformation, parameters: list[float], camera: list[list[float]], found: list[bool]) -> None:
     film = Film(kind, np.array(parameters, dtype=float), np.zeros(2))
     xy, regular = film.comparator_from_camera(np.array(camera, dtype=float))
     assert regular.tolist() == found
@@ -96,7 +87,7 @@ def view_marks(kind: Transformation, mirrored: bool, marks_mm: Array) -> tuple[A
     """The transformation's parameters, marks in a scan about (120, -110) mm, and where they are in the camera."""
     parameters = make_parameters(kind, mirrored)
     comparator = MIDDLE_MM + marks_mm[:, ::-1] + np.random.default_rng(1).uniform(-1.0, 1.0, marks_mm.shape)
-    return parameters, comparator, np.stack(camera_of_film(kind, parameters, mirrored, *comparator.T), axis=1)
+    return parameters, comparator, np.stack(nets.camera_of_film(kind, parameters, mirrored, *comparator.T), axis=1)
 
 
 @pytest.mark.parametrize(
@@ -129,9 +120,7 @@ def test_the_applied_transformation_is_found(kind: Transformation, mirrored: boo
         ("polynomial(3)", "affine", 4),
     ],
 )
-def test_few_marks_give_the_simpler_transformation(
-    kind: Transformation, simpler: Transformation, count: int, mirrored: bool
-) -> None:
+def test_few_marks_give_a_similarity(kind: Transformation, simpler: Transformation, count: int, mirrored: bool) -> None:
     """In the parameters of the one that was asked for."""
     _, comparator, camera = view_marks(simpler, mirrored, MARKS_MM[:count])
     found, is_mirrored = fit_transformation(kind, comparator, camera)
@@ -144,12 +133,12 @@ def test_few_marks_give_the_simpler_transformation(
 
 
 BENT = ["projective", "bilinear", "conformal(2)", "conformal(3)", "polynomial(2)", "polynomial(3)"]
-SCANS = Truth(middle_mm=(120.0, -115.0), mirrored=(False, True, False, False))
+SCANS = nets.Truth(middle_mm=(120.0, -115.0), mirrored=(False, True, False, False))
 
 
-def exact_network(kind: Transformation, points: int, truth: Truth | None = None) -> Network:
+def exact_network(kind: Transformation, points: int, truth: nets.Truth | None = None) -> Network:
     rng = np.random.default_rng(4)
-    return simulated(rng, truth, kind, field_points(np.random.default_rng(5), points), noise=False)[0]
+    return simulated(rng, truth, kind, nets.field_points(np.random.default_rng(5), points), noise=False)[0]
 
 
 @pytest.mark.parametrize("kind", BENT)
@@ -161,7 +150,7 @@ def test_perfect_data_leave_nothing_and_give_the_truth_back(kind: Transformation
     assert result.vpv < 1e-12
     assert np.abs(result.residuals.v_mm).max() < 1e-9
     for i in range(4):
-        expected = film_parameters(SCANS, i, kind)
+        expected = nets.film_parameters(SCANS, i, kind)
         names = [name for name in result.names if name.startswith(f"T.f{i}.")]
         off = [abs(result.value(name) - value) for name, value in zip(names, expected, strict=True)]
         assert np.all(off <= np.array([1e-5 * result.sigma(name) / result.sigma0 for name in names]))
@@ -172,7 +161,11 @@ def test_perfect_data_leave_nothing_and_give_the_truth_back(kind: Transformation
 def test_the_origin_of_the_comparator_does_not_matter(kind: Transformation) -> None:
     """A metre and a half off, as on a film strip; with exact observations, which are moved without a rounding."""
     network, _ = simulated(
-        np.random.default_rng(4), Truth(), "polynomial(3)", field_points(np.random.default_rng(5), 40), noise=False
+        np.random.default_rng(4),
+        nets.Truth(),
+        "polynomial(3)",
+        nets.field_points(np.random.default_rng(5), 40),
+        noise=False,
     )
     network = replace(network, images=tuple(replace(image, transformation=kind) for image in network.images))
     observations = network.observations
@@ -204,11 +197,11 @@ def add_marks(network: Network, count: int, images_of_marks_alone: tuple[str, ..
     def is_kept(image: str, point: str, kind: str) -> bool:
         return int(point) <= count if kind == "fiducial" else image not in images_of_marks_alone
 
-    return keep_rows(network, is_kept)
+    return nets.keep_rows(network, is_kept)
 
 
 def test_an_image_without_targets_needs_all_marks_of_its_own() -> None:
-    network, _ = simulated(np.random.default_rng(4), Truth(), "projective", noise=False)
+    network, _ = simulated(np.random.default_rng(4), nets.Truth(), "projective", noise=False)
     with pytest.raises(AdjustmentError, match=r"image f2 shows 3 fiducial marks; its projective .* needs 4\. Measure"):
         approximate(add_marks(network, 3, ("f2",)))
     result = adjust(enough := add_marks(network, 4, ("f2",)), approximate(enough))
@@ -216,10 +209,195 @@ def test_an_image_without_targets_needs_all_marks_of_its_own() -> None:
 
 
 def test_a_film_that_folds_over_is_reported() -> None:
-    network, start = simulated(np.random.default_rng(4), Truth(), "polynomial(2)", noise=False)
+    network, start = simulated(np.random.default_rng(4), nets.Truth(), "polynomial(2)", noise=False)
     folded = start.transformation["f1"].copy()
     folded[3] = 0.02  # x' turns back at some 15 mm from the middle
     with pytest.raises(
         AdjustmentError, match=r"cannot start: .* polynomial\(2\) transformation of image f1 folds over"
     ):
         adjust(network, replace(start, transformation=dict(start.transformation) | {"f1": folded}))
+
+
+SIGMA_MM = 0.004
+
+
+def observe_distances(
+    drawn: nets.DrawnFrames, rng: np.random.Generator, noise: float = 1.0, sigma_mm: float = np.inf
+) -> nets.DrawnFrames:
+    """Frames whose marks are given with a standard deviation, and all distances between them."""
+    pairs = combinations(range(len(drawn.places_mm)), 2)
+    distances = tuple(
+        FiducialDistance(
+            str(i + 1),
+            str(j + 1),
+            float(np.linalg.norm(drawn.places_mm[j] - drawn.places_mm[i]) + noise * SIGMA_MM * rng.standard_normal()),
+            SIGMA_MM,
+        )
+        for i, j in pairs
+    )
+    network = nets.give_values(drawn.network, {"x": sigma_mm, "y": sigma_mm})
+    return replace(drawn, network=nets.set_camera(network, distances=distances))
+
+
+def hold_marks(marks: int) -> list[int]:
+    """Which of all coordinates the distances leave open, as a frame of four corners or eight marks has them: both of
+    the first of the two marks farthest apart, and the one across of the other."""
+    first, last = max(
+        combinations(range(marks), 2), key=lambda two: np.hypot(*np.diff(nets.NOMINAL_MM[list(two)], axis=0)[0])
+    )
+    along = np.abs(nets.NOMINAL_MM[last] - nets.NOMINAL_MM[first])
+    return [2 * first, 2 * first + 1, 2 * last + (1 if along[0] >= along[1] else 0)]
+
+
+def written_out(drawn: nets.DrawnFrames, similar: bool) -> tuple[Array, Array, float]:
+    """Places (m, 2), their standard deviations and v'Pv: each comparator coordinate is a similarity or an affinity of
+    the place, each distance that of two places."""
+    network, marks = drawn.network, len(drawn.places_mm)
+    observed = network.observations.xy_mm.reshape(-1, marks, 2)
+    distances = network.cameras[0].distances
+    pairs = np.array([(int(each.start) - 1, int(each.end) - 1) for each in distances])
+    free = np.setdiff1d(np.arange(2 * marks), hold_marks(marks))
+    of_film = 4 if similar else 6
+
+    def split_places(x: Array) -> Array:
+        places = nets.NOMINAL_MM[:marks].ravel().copy()
+        places[free] = x[: len(free)]
+        return places.reshape(-1, 2)
+
+    def weighted(x: Array) -> Array:
+        places, rows = split_places(x), []
+        for own, p in zip(observed, x[len(free) :].reshape(len(observed), of_film), strict=True):
+            matrix = np.array([[p[2], -p[3]], [p[3], p[2]]]) if similar else p[2:].reshape(2, 2)
+            rows.append(((places @ matrix.T + p[:2]) - own).ravel() / nets.FRAME_NOISE_MM)
+        lengths = np.linalg.norm(places[pairs[:, 1]] - places[pairs[:, 0]], axis=1)
+        rows.append((lengths - [each.value_mm for each in distances]) / SIGMA_MM)
+        return np.concatenate(rows)
+
+    film = [0.0, 0.0, 1.0, 0.0] if similar else [0.0, 0.0, 1.0, 0.0, 0.0, 1.0]
+    x = np.concatenate([nets.NOMINAL_MM[:marks].ravel()[free], *[film] * len(observed)])
+    for _ in range(6):
+        jacobian = approx_fprime(x, weighted, 1e-6)
+        x = x - np.linalg.lstsq(jacobian, weighted(x))[0]
+    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    sigmas = np.zeros(2 * marks)
+    sigmas[free] = np.sqrt(np.diag(covariance))[: len(free)]
+    return split_places(x), sigmas.reshape(-1, 2), float(weighted(x) @ weighted(x))
+
+
+def places(result: Adjustment, marks: int) -> tuple[Array, Array]:
+    names = [[f"FID.{nets.FILM_CAMERA}.{i + 1}.{axis}" for axis in "xy"] for i in range(marks)]
+    values = np.array([[result.value(name) for name in pair] for pair in names])
+    sigmas = np.array([[result.sigma(name) for name in pair] for pair in names])
+    return values, sigmas
+
+
+@pytest.mark.parametrize(("marks", "kind"), [(4, "affine"), (8, "affine"), (4, "similarity"), (8, "similarity")])
+def test_places_by_distances_are_those_of_the_adjustment_written_out(marks: int, kind: str) -> None:
+    rng = np.random.default_rng(marks)
+    drawn = observe_distances(nets.draw_frames(kind, 3, marks, 1.0, 0.05, rng), rng)
+    result = adjust(drawn.network, drawn.start)
+    assert result.converged
+    expected, sigmas, vpv = written_out(drawn, kind == "similarity")
+    values, claimed = places(result, marks)
+    np.testing.assert_allclose(values, expected, atol=2e-7)
+    np.testing.assert_allclose(claimed, result.sigma0 * sigmas, rtol=1e-4, atol=1e-9)
+    unknowns = 2 * marks - 3 + 3 * (4 if kind == "similarity" else 6)
+    redundancy = 3 * 2 * marks + marks * (marks - 1) // 2 - unknowns
+    assert sum(group.redundancy for group in result.groups.values()) == pytest.approx(redundancy, abs=1e-6)
+    assert result.sigma0**2 * redundancy == pytest.approx(vpv, rel=1e-5)
+    assert result.groups["fiducial distance"].redundancy == pytest.approx(
+        sum(row.redundancy for row in result.further if row.group == "fiducial distance")
+    )
+
+
+def test_a_plan_expects_the_form_of_the_distances_and_the_datum_of_the_coordinates() -> None:
+    rng = np.random.default_rng(10)
+    drawn = observe_distances(nets.draw_frames("affine", 3, 4, 1.0, 0.0, rng, 0.0), rng, 0.0, sigma_mm=1.0)
+    planned, result = plan(drawn.network, drawn.start), adjust(drawn.network, drawn.start)
+    parameters = [Parameter.fiducial(nets.FILM_CAMERA, str(i + 1), axis) for i in range(4) for axis in "xy"]
+    form = np.array([[1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0]])  # x of the first less that of the second
+    assert planned.sigmas(parameters, form)[0] == pytest.approx(SIGMA_MM * np.sqrt(3.0 / 4.0), rel=0.35)
+    datum = np.sqrt(3.0 / 8.0)  # mm: two shifts and a turn of eight coordinates known to 1 mm
+    np.testing.assert_allclose([planned.sigma(each) for each in parameters], datum, rtol=1e-3)
+    redundancy = {row.name: row.redundancy for row in planned.adjustment.further}
+    np.testing.assert_allclose(list(redundancy.values()), [row.redundancy for row in result.further], atol=1e-4)
+
+
+def test_a_distance_to_a_mark_that_no_image_shows_says_nothing() -> None:
+    rng = np.random.default_rng(8)
+    drawn = observe_distances(nets.draw_frames("affine", 2, 4, 1.0, 0.05, rng), rng)
+    camera = drawn.network.cameras[0]
+    unseen = {**camera.fiducials, "5": Fiducial(Prior(0.0, np.inf), Prior(112.0, np.inf))}
+    distances = (*camera.distances, FiducialDistance("1", "5", 100.0, SIGMA_MM))
+    farther = nets.set_camera(drawn.network, fiducials=unseen, distances=distances)
+    alone, result = (adjust(network, drawn.start) for network in (drawn.network, farther))
+    np.testing.assert_allclose(places(result, 4)[0], places(alone, 4)[0], atol=1e-9)
+    assert len(result.further) == len(alone.further)
+
+
+def errors(halves: nets.Halves, adjustment: Adjustment) -> dict[str, np.ndarray]:
+    """Errors over standard deviations of the joins, the films at their fiducials, and the orientations."""
+    found: dict[str, list[float]] = {"joins": [], "orientations": []}
+    for (frame, point), xy in halves.joins.items():
+        for axis, true in zip("xy", xy, strict=True):
+            name = f"JOIN.{frame}.{point}.{axis}"
+            found["joins"].append((adjustment.value(name) - true) / adjustment.sigma(name))
+    if adjustment.network.observed_points:
+        for i in range(4):
+            true = [*halves.truth.stations[i], *halves.truth.attitudes[i]]
+            for element, value in zip(("X0", "Y0", "Z0", "omega", "phi", "kappa"), true, strict=True):
+                name = f"EO.f{i}.{element}"
+                found["orientations"].append((adjustment.value(name) - value) / adjustment.sigma(name))
+    return {name: np.array(each) for name, each in found.items() if each}
+
+
+def drop_targets(network: Network) -> Network:
+    return nets.keep_rows(network, lambda image, point, kind: kind != "target")
+
+
+def test_frames_without_any_target_are_joined_too() -> None:
+    simulated = halves(np.random.default_rng(4))
+    adjustment = adjust(replace(drop_targets(simulated.network), points=()))
+    assert adjustment.converged
+    assert adjustment.groups["join"].redundancy > 50.0
+    assert 0.8 < np.sqrt(np.mean(errors(simulated, adjustment)["joins"] ** 2)) < 1.2
+
+
+def test_points_as_blocks_give_what_frames_as_blocks_give() -> None:
+    """With many unknown points these are eliminated first, and the frames' unknowns are what they share."""
+    simulated = halves(np.random.default_rng(5), join_count=5, targets=120)
+    points = tuple(
+        point if int(point.id) < 6 else nets.set_sigma(point, nets.UNKNOWN) for point in simulated.network.points
+    )
+    adjustment = adjust(replace(simulated.network, points=points))
+    assert 0.9 < np.sqrt(np.mean(errors(simulated, adjustment)["joins"] ** 2)) < 1.25
+    assert 0.9 < adjustment.sigma0 < 1.1
+
+
+def test_a_gross_error_of_a_join_is_found_and_named() -> None:
+    network = halves(np.random.default_rng(7)).network
+    error = {nets.observation_row(network, "join", "f1.right", "j4"): np.full(2, 20.0 * nets.JOIN_SIGMA)}
+    (found,) = adjust(nets.add_errors(network, error), options=Options(snooping=True)).suspects
+    assert found.tested.name in ("join j4 in image f1.right", "join j4 in image f1.left")
+
+
+def test_scans_that_cannot_be_joined_are_refused() -> None:
+    network = halves(np.random.default_rng(10)).network
+    with pytest.raises(AdjustmentError, match=r"frame f0: its scan f0.right has 0 points in common with f0.left"):
+        adjust(
+            nets.keep_rows(network, lambda _, point, kind: kind == "fiducial" and point != "5")
+        )  # which both halves show
+    with pytest.raises(AdjustmentError, match=r"join j3 is observed in one scan of frame f0 only"):
+        adjust(nets.keep_rows(network, lambda image, point, _: (image, point) != ("f0.left", "j3")))
+    images = (replace(network.images[0], transformation="projective"), *network.images[1:])
+    with pytest.raises(AdjustmentError, match=r"frame f0: its scans f0.left and f0.right differ"):
+        adjust(replace(network, images=images))
+
+
+def test_a_film_that_nothing_determines_is_named_with_its_frame() -> None:
+    """All joins on one line, no mark in the right half: it can stretch across the line."""
+    simulated = halves(np.random.default_rng(13), join_count=8, overlap_mm=1e-12, join_sigma=1e-12)
+    network = replace(drop_targets(simulated.network), points=())
+    adjustment = adjust(nets.keep_rows(network, lambda image, _, kind: (image, kind) != ("f0.right", "fiducial")))
+    assert not adjustment.converged
+    assert any("f0" in each.cause and "scans" in each.cause for each in adjustment.singular), adjustment.singular

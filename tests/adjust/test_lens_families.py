@@ -4,29 +4,22 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
+import networks as nets
 import numpy as np
 import pytest
-from networks import (
-    LENSES,
-    Truth,
-    camera_point,
-    digital_network,
-    field_points,
-    given_interior,
-    lens_network,
-    set_camera,
-    simulated,
-)
 from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
-from adjust import Adjustment, AdjustmentError, Camera, Network, adjust, approximate
+from adjust import Adjustment, AdjustmentError, Calibration, Camera, Network, Parameter, adjust, approximate
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.functional_model.lens_conversion import convert_lens
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.transformation import Film
+from adjust.problem.network import Approximations, Transformation
+from adjust.quality.lens_comparison import CameraCalibration, compare
+from adjust.quality.significance import CalibrationTest
 
 Array = NDArray[np.float64]
 
@@ -71,9 +64,7 @@ def fisheye(rays: Array) -> Array:
     ("family", "lens", "pixels", "largest"),
     [("opencv", DISTORTION, skewed, 0.5), ("opencv_fisheye", FISHEYE, fisheye, 3.0)],
 )
-def test_skew_and_fisheye_are_opencvs(
-    family: str, lens: Array, pixels: Callable[[Array], Array], largest: float
-) -> None:
+def test_skew_and_fisheye_of_opencv(family: str, lens: Array, pixels: Callable[[Array], Array], largest: float) -> None:
     """Up to 72 degrees off the axis for the fisheye; the middle too; and back again."""
     rays = np.vstack([np.random.default_rng(3).uniform(-largest, largest, (60, 2)) / np.sqrt(2.0), np.zeros(2)])
     model = Lens(Distortion(family), INTERIOR, np.array([*lens, FX / FY - 1.0, SKEW / FY]))
@@ -86,15 +77,15 @@ def test_skew_and_fisheye_are_opencvs(
 
 
 def test_torlegard_is_inverted() -> None:
-    truth = Truth()
-    xyz = field_points(np.random.default_rng(1), 30)
+    truth = nets.Truth()
+    xyz = nets.field_points(np.random.default_rng(1), 30)
     angles, station = np.array(truth.attitudes[1]), np.array(truth.stations[1])
     parameters = np.array([truth.distortion.get(name, 0.0) for name in parameter_names("torlegard")])
     lens = Lens(Distortion("torlegard"), np.array([truth.c, truth.x0, truth.y0]), parameters)
     model = ImageModel(lens, rotation_from_angles(angles), station, NO_FILM)
     observed, visible = model.camera_from_object(xyz)
     assert visible.all()
-    expected = camera_point(truth, 1, xyz)
+    expected = nets.camera_point(truth, 1, xyz)
     np.testing.assert_allclose(observed, expected, atol=1e-10)
     ideal, found = model.lens.ideal_from_observed(observed)
     u, v, w = model.rotation @ (xyz - station).T
@@ -110,9 +101,7 @@ def test_what_has_no_image_is_reported() -> None:
     _, found = Lens(fold, np.array([100.0, 0.0, 0.0]), parameters).camera_from_ray(np.array([[0.3, 0.0], [2.0, 0.0]]))
     assert list(found) == [True, False]
     barrel = np.array([-0.3] + [0.0] * 15)  # OpenCV's k1: the image of a ray turns back at a slope of 1.05
-    _, found = Lens(Distortion("opencv"), np.array([100.0, 0.0, 0.0]), barrel).camera_from_ray(
-        np.array([[0.9, 0], [1.2, 0]])
-    )
+    _, found = Lens(Distortion("opencv"), np.array([1e2, 0, 0]), barrel).camera_from_ray(np.array([[0.9, 0], [1.2, 0]]))
     assert list(found) == [True, False]
     model = ImageModel(Lens(Distortion(), np.array([100.0, 0.0, 0.0]), np.empty(0)), np.eye(3), np.zeros(3), NO_FILM)
     _, visible = model.comparator_from_object(np.array([[0.0, 0.0, -5.0], [0.0, 0.0, 5.0], [1.0, 0.0, 0.0]]))
@@ -140,10 +129,10 @@ def wide_network(seed: int, lens: Array = WIDE) -> Network:
         pixels = pixels.reshape(-1, 2)
         shown = np.flatnonzero(((pixels > 0.0) & (pixels < SIZE_PX)).all(axis=1))
         rows += [(f"i{i}", str(j), mm(pixels[j]) + rng.normal(0.0, noise_mm, 2)) for j in shown]
-    interior = given_interior(PIXEL_MM * np.array([WIDE_FX, CX, -CY]), np.inf)
+    interior = nets.given_interior(PIXEL_MM * np.array([WIDE_FX, CX, -CY]), np.inf)
     wide = Camera("D", *interior, Distortion("opencv", {name: Prior(0.0, np.inf) for name in RATIONAL}))
     found = {row[1] for row in rows}
-    return digital_network(wide, rows, {k: v for k, v in numbered(xyz).items() if k in found}, noise_mm)
+    return nets.digital_network(wide, rows, {k: v for k, v in numbered(xyz).items() if k in found}, noise_mm)
 
 
 @pytest.mark.parametrize("seed", [0, 2])
@@ -166,7 +155,7 @@ def test_a_rational_distortion_begins_at_zero(seed: int) -> None:
     ],
 )
 def test_a_distortion_that_folds_the_image_over_is_named(family: str, parameters: dict[str, float], words: str) -> None:
-    network, _ = simulated(np.random.default_rng(5), points=field_points(np.random.default_rng(6), 15))
+    network, _ = nets.simulated(np.random.default_rng(5), points=nets.field_points(np.random.default_rng(6), 15))
     folding = Distortion(family, {name: Prior(value, np.inf) for name, value in parameters.items()})
     folded = replace(network, cameras=(replace(network.cameras[0], distortion=folding),))
     sentence = rf"camera K: the distortion that is given \(k. = \S+\) folds the image.*{words}"
@@ -253,9 +242,7 @@ def test_gruens_formula_as_published() -> None:
 @pytest.mark.parametrize(
     ("family", "points"), [("ebner", np.linspace(-1, 1, 3)), ("gruen", np.linspace(-1, 1, 5))]
 )  # fmt: skip
-def test_on_their_grid_the_parameters_are_orthogonal_and_free_of_the_orientation(
-    family: str, points: Array, half_mm: tuple[float, float]
-) -> None:
+def test_parameters_on_their_grid_are_orthogonal(family: str, points: Array, half_mm: tuple[float, float]) -> None:
     xy = grid(points, half_mm)
     found = columns(family, xy, half_mm)
     assert are_orthogonal(found)
@@ -314,9 +301,9 @@ def test_another_r0_is_another_principal_distance() -> None:
 def test_covariance_is_that_of_the_same_data_adjusted_in_the_other_family() -> None:
     """Values to a millionth of their sigmas, the covariance to a millionth: aicon with r0 as OpenCV's."""
     rng = np.random.default_rng(2)
-    first = adjust_network(lens_network("aicon", rng), ("a1", "a2", "b1", "b2"))
+    first = adjust_network(nets.lens_network("aicon", rng), ("a1", "a2", "b1", "b2"))
     network = first.network
-    other = set_camera(network, distortion=Distortion("opencv"))
+    other = nets.set_camera(network, distortion=Distortion("opencv"))
     second = adjust_network(other, ("k1", "k2", "p1", "p2"))
     source, names = quantities("aicon"), quantities("opencv")
     values = np.array([first.value(name) for name in source])
@@ -339,7 +326,7 @@ def quantities(family: str) -> list[str]:
 
 def adjust_network(network: Network, free: tuple[str, ...]) -> Adjustment:
     unknown = dict.fromkeys(free, Prior(0.0, np.inf))
-    network = set_camera(network, distortion=replace(network.cameras[0].distortion, parameters=unknown))
+    network = nets.set_camera(network, distortion=replace(network.cameras[0].distortion, parameters=unknown))
     return adjust(network, approximate(network))
 
 
@@ -352,10 +339,10 @@ def test_what_no_family_takes_is_known_by_its_residual() -> None:
     assert found.rms_mm < found.largest_mm
 
 
-@pytest.mark.parametrize("source", list(LENSES))
+@pytest.mark.parametrize("source", list(nets.LENSES))
 @pytest.mark.parametrize("target", ["torlegard", "brown", "australis", "aicon", "opencv", "opencv_fisheye"])
 def test_every_lens_comes_near_every_other(source: str, target: str) -> None:
-    c, given = LENSES[source]
+    c, given = nets.LENSES[source]
     lens = values(source, **given), np.array([c, 0.12, -0.07])
     into = Distortion(target, r0_mm=10.0 if target in ("torlegard", "aicon") else 0.0)
     found = convert_lens(Lens(Distortion(source, r0_mm=13.0), lens[1], lens[0]), into, CORNERS_MM / 2.0)
@@ -371,17 +358,17 @@ def test_a_frame_without_an_image_is_refused() -> None:
         convert_lens(Lens(Distortion("opencv"), GIVEN_MM, np.zeros(16)), Distortion("brown"), CORNERS_MM, ("a1",))
 
 
-@parametrize_with_studies("name", list(LENSES))
+@parametrize_with_studies("name", list(nets.LENSES))
 def test_nothing_but_the_points_has_to_be_known(name: str) -> None:
     """Neither c nor the principal point; of the fisheye points up to 80 degrees off the axis."""
-    network = lens_network(name, np.random.default_rng(1))
-    network = set_camera(network, principal_distance_mm=None, x0_mm=None, y0_mm=None)
+    network = nets.lens_network(name, np.random.default_rng(1))
+    network = nets.set_camera(network, principal_distance_mm=None, x0_mm=None, y0_mm=None)
     start = approximate(network)
-    assert start.interior["L"][0] == pytest.approx(LENSES[name][0], rel=0.1)
+    assert start.interior["L"][0] == pytest.approx(nets.LENSES[name][0], rel=0.1)
     found = adjust(network, start)
     assert found.converged
     assert 0.9 < found.sigma0 < 1.1
-    assert abs(found.value("IO.L.c") - LENSES[name][0]) < 4.0 * found.sigma("IO.L.c")
+    assert abs(found.value("IO.L.c") - nets.LENSES[name][0]) < 4.0 * found.sigma("IO.L.c")
 
 
 def test_every_parameter_has_its_unit_and_a_ladder_names_only_parameters() -> None:
@@ -389,3 +376,209 @@ def test_every_parameter_has_its_unit_and_a_ladder_names_only_parameters() -> No
         of = family(name)
         assert all(of.unit(each) for each in of.parameters)
         assert {each for rung in of.ladder for each in rung.split()} <= set(of.parameters)
+
+
+HALF = (110.0, 110.0)
+MARKS = {str(i): np.array(xy, float) for i, xy in enumerate([(-106, -106), (106, -106), (106, 106), (-106, 106)])}
+TRUE = np.array([153.0, 0.010, -0.006, -6e-8, 1e-12, 2e-7, -1e-7])  # c, x0, y0, k3, k5, p1, p2
+SIGMAS = np.array([0.004, 0.003, 0.003, 8e-9, 4e-13, 6e-8, 6e-8])
+
+
+def covariance() -> Array:
+    """Of c, principal point, k3, k5, k7, p1..p4 and the marks: k3 and k5, x0 and p1 as closely tied as in practice."""
+    mixing = np.eye(7)
+    mixing[3, 4] = mixing[4, 3] = -0.9
+    mixing[1, 5] = mixing[5, 1] = 0.6
+    seven = mixing * np.outer(SIGMAS, SIGMAS)
+    whole = np.zeros((18, 18))
+    at = np.ix_(AT, AT)
+    whole[at] = seven
+    whole[10:, 10:] = 0.002**2 * np.eye(8)
+    return whole
+
+
+AT = np.array([0, 1, 2, 3, 4, 6, 7])  # in c, x0, y0, k3, k5, k7, p1, p2, p3, p4
+
+
+def calibration(values: Array, marks: dict[str, Array] | None = None) -> CameraCalibration:
+    whole = np.zeros(10)
+    whole[AT] = values
+    return CameraCalibration(
+        "K", Lens(Distortion("torlegard"), whole[:3], whole[3:]), dict(marks or MARKS), covariance(), redundancy=5000
+    )
+
+
+def draw_calibration(rng: np.random.Generator, change: Array | float = 0.0) -> CameraCalibration:
+    error = rng.multivariate_normal(np.zeros(18), covariance())
+    marks = {id: xy + error[10 + 2 * i : 12 + 2 * i] for i, (id, xy) in enumerate(MARKS.items())}
+    return calibration(TRUE + change + error[AT], marks)
+
+
+def test_false_alarms_come_as_often_as_stated() -> None:
+    rng = np.random.default_rng(1)
+    probabilities = np.array(
+        [compare([draw_calibration(rng), draw_calibration(rng)], HALF).same.probability for _ in range(160)]
+    )
+    for level in (0.05, 0.5):
+        expected = 160 * level
+        assert abs(int((probabilities < level).sum()) - expected) < 3.5 * np.sqrt(expected * (1 - level))
+
+
+def test_a_trend_is_found() -> None:
+    rng = np.random.default_rng(2)
+    years, drift = np.array([1952.0, 1955.0, 1961.0, 1970.0]), np.zeros(7)
+    drift[3] = 4e-9  # k3 a year
+    moving = compare([draw_calibration(rng, drift * (year - years[0])) for year in years], HALF, years)
+    assert moving.trend is not None
+    assert moving.trend.freedom == moving.same.freedom / 3
+    assert moving.probability < 1e-3
+    still = compare([calibration(TRUE + drift * (year - years[0])) for year in years], HALF, years)
+    ends = compare([calibration(TRUE), calibration(TRUE + drift * 18.0)], HALF)
+    assert still.trend_um == pytest.approx(ends.field_um[0], abs=0.05)
+
+
+def test_over_flat_ground_another_principal_distance_is_another_height() -> None:
+    change = np.array([0.05, 0.04, 0.0, 0.0, 0.0, 0.0, 0.0])
+    pair = [calibration(TRUE), calibration(TRUE + change)]
+    assert compare(pair, HALF).same.probability < 1e-6
+    assert np.abs(compare(pair, HALF, use="flat").field_um).max() < 1.0  # what the lens shifts with its point
+    assert np.abs(compare(pair, HALF).field_um).max() > 3.0
+
+
+@pytest.mark.parametrize(
+    ("count", "times", "words"), [(1, None, "two calibrations or more"), (2, (1960.0, 1950.0), "in rising order")]
+)
+def test_what_cannot_be_compared_is_refused(count: int, times: tuple[float, ...] | None, words: str) -> None:
+    with pytest.raises(AdjustmentError, match=words):
+        compare([calibration(TRUE)] * count, HALF, times)
+
+
+def two_networks(kind: Transformation, noise: float) -> tuple[tuple[Network, Approximations], ...]:
+    """Two data sets of one camera, their names with an A and a B, and both together; errors as small as one likes."""
+    networks = []
+    for prefix, seed in (("A{}", 1), ("B{}", 2)):
+        rng = np.random.default_rng(seed)
+        free = {"k3": np.inf, "p1": np.inf}
+        network, start = nets.simulated(rng, None, kind, nets.field_points(rng, 14), 0.0, free, False, 0.002 * noise)
+        network = noisy(network, rng, noise)
+        networks.append(nets.rename_network(network, start, "K", str, prefix.format, prefix.format))
+    a, b = networks
+    return a, b, nets.join_networks(a, b)
+
+
+def make_calibration(result: Adjustment, fiducials: bool) -> Calibration:
+    kinds = ("interior", "fiducial") if fiducials else ("interior",)
+    taken = [each for each in result.parameters if each.kind in kinds and result.cofactor_of([each])[0, 0] > 0.0]
+    return Calibration(tuple(taken), result.values_of(taken), result.cofactor_of(taken))
+
+
+def set_calibration(network: Network, calibration: Calibration) -> Network:
+    """The network with that calibration in the place of the camera's priors."""
+    value = dict(zip((each.text for each in calibration.parameters), calibration.values.tolist(), strict=True))
+    free = nets.map_priors(network, lambda name, prior: Prior(value[name], np.inf) if name in value else prior)
+    return replace(free, calibrations=(calibration,))
+
+
+@pytest.mark.parametrize("kind", [pytest.param("none", marks=pytest.mark.study), "affine"])
+def test_an_earlier_calibration_stands_for_its_observations(kind: Transformation) -> None:
+    """A, then B with A's calibration, is A and B together: values, sigmas, v'Pv and redundancy.
+
+    The calibration is A made linear, so that with real errors the difference is of second order, some 5e-4 of the
+    standard deviations; with errors of a thousandth it must be a thousand times less.
+    """
+    differences = []
+    for noise in (1.0, 1e-3):
+        (a, start_a), (b, start_b), (joint, start_joint) = two_networks(kind, noise)
+        first, both = adjust(a, start_a), adjust(joint, start_joint)
+        second = adjust(set_calibration(b, make_calibration(first, kind != "none")), start_b)
+        assert second.converged
+        names = [name for name in second.names if both.cofactor_of([name])[0, 0] > 0.0]
+        sigmas = np.sqrt([both.cofactor_of([name])[0, 0] for name in names])
+        change = np.array([second.value(name) - both.value(name) for name in names]) / sigmas
+        differences.append(float(np.abs(change).max()))
+        np.testing.assert_allclose(np.sqrt([second.cofactor_of([n])[0, 0] for n in names]), sigmas, rtol=1e-4 * noise)
+        assert first.vpv + second.vpv == pytest.approx(both.vpv, abs=1e-3 * noise)
+        assert first.redundancy + second.redundancy == both.redundancy
+        assert sum(group.redundancy for group in second.groups.values()) == pytest.approx(second.redundancy)
+        assert second.warnings == ()
+    assert differences[0] < 1e-3
+    assert differences[1] < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda n, c: set_calibration(n, replace(c, parameters=(Parameter.interior("K", "q"), *c.parameters[1:]))),
+            ["q of camera K", "no camera has"],
+        ),
+        (lambda n, c: replace(n, calibrations=(c,)), ["c of camera K", "standard deviation of its own (1)", "twice"]),
+        (lambda n, c: replace(set_calibration(n, c), calibrations=(c, c)), ["c of camera K", "another calibration"]),
+        (
+            lambda n, c: set_calibration(n, replace(c, covariance=np.ones_like(c.covariance))),
+            ["not positive definite", "c, x0 and y0 of camera K"],
+        ),
+        (lambda n, c: set_calibration(n, replace(c, covariance=c.covariance[:2])), ["shape (2, 5)"]),
+    ],
+)
+def test_no_such_calibration_is_refused(change: Callable[[Network, Calibration], Network], words: list[str]) -> None:
+    network, start = nets.simulated(np.random.default_rng(5), kind="none", free={"k3": np.inf, "p1": np.inf})
+    own = tuple(Parameter.interior("K", name) for name in ("c", "x0", "y0", "k3", "p1"))
+    calibration = Calibration(own, np.array([153.0, 0.0, 0.0, 1.5e-7, 0.0]), np.diag([1.0, 1.0, 1.0, 1e-18, 1e-16]))
+    with pytest.raises(AdjustmentError) as error:
+        adjust(change(network, calibration), start)
+    for word in words:
+        assert word in str(error.value)
+
+
+def noisy(network: Network, rng: np.random.Generator, scale: float) -> Network:
+    """A network without errors to speak of, its observations drawn by covariances so many times as large."""
+    rows = network.observations
+    covariance = scale**2 * rows.covariance_mm2
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    return nets.set_observations(network, xy_mm=rows.xy_mm + rng.normal(0.0, sigma), covariance_mm2=covariance)
+
+
+def test_an_earlier_calibration_is_tested_as_a_whole() -> None:
+    """Against the calibration of the new images alone: d' (C_old + C_new)^-1 d, their sigma0, and d itself."""
+    (a, start_a), (b, start_b), _ = two_networks("none", 1.0)
+    calibration = make_calibration(adjust(a, start_a), False)
+    changed = replace(calibration, values=calibration.values + 2.0 * np.sqrt(np.diag(calibration.covariance)))
+    network = set_calibration(b, changed)
+    alone = adjust(replace(network, calibrations=()), start_b)
+    (found,) = adjust(network, start_b).contradictions
+    names = list(calibration.parameters)
+    difference = np.array([alone.value(name) for name in names]) - changed.values
+    joint = changed.covariance + alone.cofactor_of(names)
+    chi_square = difference @ np.linalg.solve(joint, difference)
+    assert found.parameters == calibration.parameters
+    assert found.freedom == len(names)
+    assert found.statistic == pytest.approx(chi_square / len(names) / alone.sigma0**2, rel=0.02)
+    sigma = alone.sigma0 * np.sqrt(np.diag(joint))
+    np.testing.assert_allclose(found.sigma, sigma, rtol=0.02)
+    np.testing.assert_allclose(found.difference / sigma, difference / sigma, atol=0.05)
+    assert found.direction[0] == np.argmax(np.abs(difference) / sigma)
+
+
+def test_a_contradiction_is_reported_next_to_what_the_marks_show() -> None:
+    """Fiducials, films and camera together can shift, turn and grow, of which images alone say nothing: what is told is
+    what is left where the marks lie over one another."""
+    (a, start_a), (b, start_b), _ = two_networks("affine", 1.0)
+    calibration = make_calibration(adjust(a, start_a), True)
+    c, x0 = (calibration.parameters.index(Parameter.interior("K", name)) for name in ("c", "x0"))
+    along_x = np.array([each.quantity in ("x0", "x") for each in calibration.parameters])
+
+    def find(change: NDArray[np.float64]) -> CalibrationTest:
+        given = set_calibration(b, replace(calibration, values=calibration.values + change))
+        (finding,) = adjust(given, start_b).contradictions
+        return finding
+
+    same, shifted = find(0.0 * along_x), find(0.05 * along_x)
+    longer = find(0.3 * (np.arange(len(along_x)) == c))
+    assert same.freedom == len(same.parameters) - 4
+    assert same.probability > 1e-3
+    assert np.isfinite(same.difference).all()
+    np.testing.assert_allclose(shifted.difference / same.sigma, same.difference / same.sigma, atol=0.05)
+    assert longer.direction[0] == c
+    assert longer.difference[c] == pytest.approx(same.difference[c] - 0.3, abs=0.01)
+    assert longer.difference[x0] == pytest.approx(same.difference[x0], abs=0.2 * same.sigma[x0])

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from dense_adjustment import row_roots
 from faults import AXES
 from networks import Truth, field_points, keep_rows, set_prior, simulated
 from numpy.typing import NDArray
-from row_roots import row_roots
 from scipy.sparse import csc_array, csr_array, eye_array, vstack
 from scipy.sparse.linalg import splu
 
@@ -208,9 +208,7 @@ def sparse_rows(rows: WhitenedRows, weights: Array) -> csc_array:
 
 @pytest.mark.usefixtures("finely")
 @pytest.mark.parametrize("summed", [False, True])
-def test_a_strip_in_fronts_has_the_inverse_of_its_sparse_normal_equations(
-    summed: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_strip_in_fronts_has_its_sparse_inverse(summed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Against SuperLU: solution, variances, covariances of every image, hat matrices of every block."""
     if summed:
         monkeypatch.setattr(elimination, "REFLECTED", 0.0)
@@ -275,9 +273,7 @@ def levelled(count: int, weight: float) -> tuple[Factor, list[Blocks]]:
 @pytest.mark.usefixtures("finely")
 @pytest.mark.parametrize("wide", [0, 500])
 @pytest.mark.parametrize("weight", [1.0, 1e-6])
-def test_variances_along_a_line_are_those_of_its_differences(
-    weight: float, wide: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_variances_along_a_line_by_its_differences(weight: float, wide: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """However weak its datum, which makes the heights uncertain by a million, and not what is observed."""
     monkeypatch.setattr(sparse_factor, "WIDE", wide)
     count = 400

@@ -16,9 +16,7 @@ C_MM, HALF_MM, SIGMA_MM = 50.0, np.array([18.0, 12.0]), 0.003
 def photographed(xyz: Array, rng: np.random.Generator, share: float = 0.2) -> tuple[Array, NDArray[np.intp]]:
     """Marks (m, 2) from an oblique side, a share of the points missing and as many marks that are none; their points
     (m,), -1 for none. The true principal distance is 2 % longer than the given one, and there is barrel distortion."""
-    rotation = rotation_from_vector(np.array([0.0, 0.0, rng.uniform(-3.0, 3.0)])) @ rotation_from_vector(
-        np.array([0.5, -0.3, 0.0])
-    )
+    rotation = rotation_from_vector(rng.uniform(-3, 3) * np.eye(3)[2]) @ rotation_from_vector(np.array([0.5, -0.3, 0]))
     camera = xyz @ rotation.T - (0.02, -0.03, 1.7)
     p = camera[:, :2] / -camera[:, 2:]
     xy = 1.02 * C_MM * p * (1.0 - 0.1 * (p**2).sum(axis=1, keepdims=True)) + rng.normal(0.0, SIGMA_MM, p.shape)

@@ -1,34 +1,27 @@
 """Bad input, one thing at a time, and the keys of quantities."""
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, cast
 
+import matplotlib as mpl
+import matplotlib.figure
+import networks as nets
 import numpy as np
 import pytest
-from networks import (
-    add_errors,
-    drop_rows,
-    keep_rows,
-    set_camera,
-    set_images,
-    set_observations,
-    simulated,
-)
+from matplotlib.axes import Axes
+from matplotlib.quiver import Quiver
 
-from adjust import Distortion, Exterior, Network, ObjectPoint, Prior
-from adjust.errors import AdjustmentError, DatumError
+from adjust import Adjustment, AdjustmentError, Distortion, Exterior, Network, ObjectPoint, Parameter, Prior, adjust
+from adjust.display import contour_levels, distance_text
+from adjust.errors import DatumError
 from adjust.problem.camera import FiducialDistance
 from adjust.problem.network import Board, Scanner
 from adjust.problem.observations import Distance
-from adjust.problem.parameter import (
-    Parameter,
-    object_coordinate,
-    parameter_from_text,
-    parameters_from_texts,
-)
+from adjust.problem.parameter import object_coordinate, parameter_from_text, parameters_from_texts
 from adjust.quality.tested import Probabilities, WeightFunction
-from adjust.solution.adjustment import Datum, Options, adjust
+from adjust.solution.adjustment import Datum, Options
 
 Change = Callable[[Network], Network]
 
@@ -37,17 +30,17 @@ def drop_observations(network: Network, image: str, kind: str, left: int) -> Net
     """All but some marks of a kind in an image."""
     observations = network.observations
     places = [i for i in range(len(observations)) if (observations.image[i], observations.kind[i]) == (image, kind)]
-    return drop_rows(network, places[left:])
+    return nets.drop_rows(network, places[left:])
 
 
 def drop_fiducial(network: Network) -> Network:
-    return set_camera(network, fiducials={k: mark for k, mark in network.cameras[0].fiducials.items() if k != "3"})
+    return nets.set_camera(network, fiducials={k: mark for k, mark in network.cameras[0].fiducials.items() if k != "3"})
 
 
 def bad_covariance(network: Network) -> Network:
     covariance = network.observations.covariance_mm2.copy()
     covariance[8] = [[1e-6, 2e-6], [2e-6, 1e-6]]
-    return set_observations(network, covariance_mm2=covariance)
+    return nets.set_observations(network, covariance_mm2=covariance)
 
 
 def set_distance(network: Network, *distance: Any) -> Network:
@@ -57,7 +50,7 @@ def set_distance(network: Network, *distance: Any) -> Network:
 
 
 def set_fiducial_distance(network: Network, *distance: Any) -> Network:
-    return set_camera(network, distances=(FiducialDistance(*distance),))
+    return nets.set_camera(network, distances=(FiducialDistance(*distance),))
 
 
 def observed_twice(network: Network) -> Network:
@@ -66,7 +59,7 @@ def observed_twice(network: Network) -> Network:
 
 GALLERY: dict[str, tuple[Change, list[str]]] = {
     "no images": (lambda n: replace(n, images=()), ["nothing to adjust", "no image"]),
-    "no observations": (lambda n: keep_rows(n, lambda *_: False), ["nothing to adjust", "statuses"]),
+    "no observations": (lambda n: nets.keep_rows(n, lambda *_: False), ["nothing to adjust", "statuses"]),
     "camera twice": (lambda n: replace(n, cameras=n.cameras * 2), ["camera K", "more than once"]),
     "image twice": (lambda n: replace(n, images=(*n.images, n.images[2])), ["image f2", "more than once"]),
     "point twice": (lambda n: replace(n, points=(*n.points, n.points[4])), ["object point 4", "more than once"]),
@@ -79,23 +72,26 @@ GALLERY: dict[str, tuple[Change, list[str]]] = {
     "unknown fiducial": (drop_fiducial, ["fiducial 3", "image f0", "camera K"]),
     "observed twice": (observed_twice, ["point 2", "2 times", "image f0"]),
     "covariance": (bad_covariance, ["target 3", "image f0", "not positive definite"]),
-    "nan": (lambda n: add_errors(n, {9: np.array([0.0, np.nan])}), ["target 4", "image f0", "not a finite number"]),
+    "nan": (
+        lambda n: nets.add_errors(n, {9: np.array([0.0, np.nan])}),
+        ["target 4", "image f0", "not a finite number"],
+    ),
     "two targets": (lambda n: drop_observations(n, "f1", "target", 2), ["image f1", "2 object points", "needs 3"]),
     "two fiducials": (
         lambda n: drop_observations(n, "f3", "fiducial", 2),
         ["image f3", "2 fiducial", "affine", "needs 3"],
     ),
     "two of four": (
-        lambda n: drop_observations(set_images(n, transformation="projective"), "f3", "fiducial", 2),
+        lambda n: drop_observations(nets.set_images(n, transformation="projective"), "f3", "fiducial", 2),
         ["image f3", "2 fiducial", "projective transformation needs 3", "4 where its targets tell nothing of it"],
     ),
     "no fiducials": (lambda n: drop_observations(n, "f3", "fiducial", 0), ["image f3", "0 fiducial", "needs 3"]),
     "parameter": (
-        lambda n: set_camera(n, distortion=Distortion("torlegard", {"k9": Prior(1.0)})),
+        lambda n: nets.set_camera(n, distortion=Distortion("torlegard", {"k9": Prior(1.0)})),
         ["camera K", "torlegard", "k9", "k3, k5"],
     ),
     "rows do not go together": (
-        lambda n: set_observations(n, point=n.observations.point[:-1]),
+        lambda n: nets.set_observations(n, point=n.observations.point[:-1]),
         ["do not go together"],
     ),
     "distance to what is not": (lambda n: set_distance(n, "0", "no", 1.0, 0.1), ["from 0 to no", "neither"]),
@@ -121,7 +117,7 @@ GALLERY: dict[str, tuple[Change, list[str]]] = {
         ["needs a positive standard deviation"],
     ),
     "c": (
-        lambda n: set_camera(n, principal_distance_mm=Prior(-153.0, 1.0)),
+        lambda n: nets.set_camera(n, principal_distance_mm=Prior(-153.0, 1.0)),
         ["camera K: the principal distance must be positive"],
     ),
 }
@@ -130,7 +126,7 @@ GALLERY: dict[str, tuple[Change, list[str]]] = {
 @pytest.mark.parametrize("name", list(GALLERY))
 def test_gallery(name: str) -> None:
     change, words = GALLERY[name]
-    network, start = simulated(np.random.default_rng(1))
+    network, start = nets.simulated(np.random.default_rng(1))
     with pytest.raises(AdjustmentError) as caught:
         adjust(change(network), start)
     for word in words:
@@ -139,7 +135,7 @@ def test_gallery(name: str) -> None:
 
 def test_approximations_that_are_missing_or_turned_away() -> None:
     """Of f2 the station lies below the field: every point is behind the camera."""
-    network, start = simulated(np.random.default_rng(1))
+    network, start = nets.simulated(np.random.default_rng(1))
     below = dict(start.exterior) | {"f2": start.exterior["f2"] * np.array([1, 1, -1, 1, 1, 1])}
     with pytest.raises(AdjustmentError, match=r"point 0 lies behind the camera in image f2"):
         adjust(network, replace(start, exterior=below))
@@ -231,3 +227,119 @@ def test_a_coordinate_is_called_by_its_point() -> None:
     assert object_coordinate("roll.1.X") == Parameter.point("roll.1", "X")
     with pytest.raises(DatumError, match=r"a dot and X, Y or Z"):
         object_coordinate("12")
+
+
+PIXEL_MM = 0.005
+
+
+@pytest.fixture(scope="module")
+def board() -> Adjustment:
+    mpl.use("Agg")
+    return adjust(nets.board_network(np.random.default_rng(3), 6, 5e-4))
+
+
+@pytest.fixture(scope="module")
+def film() -> Adjustment:
+    mpl.use("Agg")
+    rng, truth = np.random.default_rng(2), nets.Truth()
+    network, start = nets.simulated(
+        rng, truth, points=nets.field_points(rng, 40), free=dict.fromkeys(truth.distortion, np.inf)
+    )
+    return adjust(
+        replace(network, cameras=(replace(network.cameras[0], frame_mm=(2 * nets.HALF_MM, 2 * nets.HALF_MM)),)), start
+    )
+
+
+def vectors(axes: Axes) -> list[Any]:
+    return [each for each in axes.collections if isinstance(each, Quiver)]
+
+
+def test_residuals_are_vectors_along_the_axes_of_the_picture(board: Adjustment) -> None:
+    axes = board.plots(pixel_mm=PIXEL_MM).plot_residuals()
+    (quiver,) = vectors(axes)
+    v_px = board.residuals.v_mm / PIXEL_MM * [1.0, -1.0]
+    np.testing.assert_allclose(np.column_stack([quiver.U, quiver.V]), v_px)
+    np.testing.assert_allclose(quiver.XY, board.network.observations.xy_mm / PIXEL_MM * [1.0, -1.0])
+    assert axes.get_ylim()[0] > axes.get_ylim()[1]  # rows count downwards
+    assert "px a point" in axes.get_title(loc="left")
+
+
+def test_of_film_both_kinds_of_marks_are_shown_in_the_camera_frame(film: Adjustment) -> None:
+    axes = film.plot_residuals()
+    kinds = vectors(axes)
+    assert [len(each.U) for each in kinds] == [160, 20]
+    assert np.abs(kinds[1].XY).max() == pytest.approx(113.0, abs=2.0)
+    assert "µm a point" in axes.get_title(loc="left")
+    assert axes.get_xlabel() == "x' (mm)"
+
+
+def test_the_distortion_is_the_polynomial_of_the_parameters(film: Adjustment) -> None:
+    axes = film.plot_distortion()
+    radius, um = np.array(axes.lines[0].get_data())
+    k3, k5 = (film.value(Parameter.interior("K", name)) for name in ("k3", "k5"))
+    np.testing.assert_allclose(um, 1e3 * (k3 * radius**3 + k5 * radius**5), atol=0.05)
+    assert axes.get_legend_handles_labels()[1][-1] == "no targets"
+
+
+def test_the_map_of_uncertainty_is_in_pixels_for_a_digital_camera(board: Adjustment) -> None:
+    axes = board.plots(pixel_mm=PIXEL_MM).plot_uncertainty(350.0)
+    assert axes.get_title(loc="left") == "desk: projected points at a distance of 350"
+    sigma_px = board.projection_uncertainty(distance=350.0).sigma_mm / PIXEL_MM
+    assert axes.collections[0].get_clim()[0] >= sigma_px.min()
+    assert axes.collections[0].get_clim()[1] <= sigma_px.max()
+
+
+def test_coverage_counts_targets_alone(film: Adjustment) -> None:
+    axes = film.plot_coverage()
+    assert axes.get_title(loc="left").startswith("K: 160 targets in 4 images")
+    assert np.ma.sum(np.ma.asarray(axes.collections[0].get_array())) == 160
+
+
+def test_plots_go_into_axes_that_are_given(board: Adjustment) -> None:
+    axes = mpl.figure.Figure().subplots()
+    assert board.plot_coverage(axes=axes) is axes
+
+
+@pytest.mark.parametrize(
+    ("values", "levels"),
+    [
+        ([0.012, 3.0], [0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0]),
+        ([0.06, 0.4], [0.07, 0.1, 0.15, 0.2, 0.3]),
+        ([1.02, 1.49], [1.05, 1.1, 1.15, 1.2, 1.25, 1.3, 1.35, 1.4, 1.45]),
+    ],
+)
+def test_contours_have_round_levels(values: list[float], levels: list[float]) -> None:
+    assert contour_levels(np.array([*values, np.nan])) == levels
+
+
+def test_a_camera_of_which_nothing_was_estimated_has_no_contours_and_a_distance_no_exponent() -> None:
+    with pytest.raises(AdjustmentError, match="nothing was estimated"):
+        contour_levels(np.zeros((3, 3)))
+    assert [distance_text(each) for each in (1500.0, 0.3456789, 12345.6)] == ["1500", "0.3457", "12350"]
+
+
+@pytest.mark.parametrize(
+    ("missing", "method", "words"),
+    [
+        *(
+            ("matplotlib.pyplot", f"plot_{kind}", r'"reseau\[plots\]"\.')
+            for kind in ("residuals", "distortion", "uncertainty", "coverage")
+        ),
+        ("pandas", "to_pandas", "pandas"),
+    ],
+)
+def test_install(board: Adjustment, missing: str, method: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, missing, None)
+    with pytest.raises(ImportError, match=f"Install: pip install {words}"):
+        getattr(board, method)()
+
+
+def test_tables_have_every_quantity_and_every_observation(board: Adjustment) -> None:
+    pytest.importorskip("pandas", reason="pandas is missing: make test installs it")
+    parameters = board.to_pandas()
+    row = parameters[(parameters.kind == "interior") & (parameters.quantity == "c")].iloc[0]
+    assert row.value == board.value("IO.desk.c")
+    assert row.sigma == pytest.approx(board.sigma("IO.desk.c"))
+    residuals = board.to_pandas("residuals")
+    assert len(residuals) == len(board.network.observations)
+    np.testing.assert_allclose(residuals[["vx_um", "vy_um"]], 1e3 * board.residuals.v_mm)

@@ -4,23 +4,9 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 
+import networks as nets
 import numpy as np
 import pytest
-from networks import (
-    BOARD_FRAME_MM,
-    BOARD_TRUTH,
-    FIDUCIALS,
-    HALF_MM,
-    Truth,
-    board_network,
-    camera_point,
-    field_points,
-    keep_rows,
-    rotation,
-    set_camera,
-    set_observations,
-    simulated,
-)
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
@@ -45,10 +31,10 @@ FILM_MM = np.array([(0.0, 0.0), (70.0, 60.0), (-80.0, 40.0), (20.0, -90.0), (-60
 
 
 def test_it_is_what_mrcal_says_of_the_same_pictures() -> None:
-    network = board_network(np.random.default_rng(3), 12, 5e-4)
+    network = nets.board_network(np.random.default_rng(3), 12, 5e-4)
     lens = Distortion("opencv", dict.fromkeys(("k1", "k2", "p1", "p2", "b1"), FREE))
     places = {each.id: np.array([each.X.value, each.Y.value, 0.0]) for each in network.points if each.X and each.Y}
-    result = adjust(replace(set_camera(network, distortion=lens), boards=(Board("b", places),)))
+    result = adjust(replace(nets.set_camera(network, distortion=lens), boards=(Board("b", places),)))
     for distance, sigma_px in MRCAL_SIGMA_PX.items():
         found = result.projection_uncertainty("desk", distance, MRCAL_PX * PIXEL_MM * [1.0, -1.0])
         np.testing.assert_allclose(found.sigma_model_mm / PIXEL_MM, sigma_px, rtol=2e-3, atol=6e-5)
@@ -78,7 +64,7 @@ def board_sample(
     """Claimed covariances of places on the board's pictures, where these are projected, and where they are."""
     network = true.network
     noise = 5e-4 * rng.normal(size=network.observations.xy_mm.shape)
-    result = adjust(set_observations(network, xy_mm=network.observations.xy_mm + noise), start)
+    result = adjust(nets.set_observations(network, xy_mm=network.observations.xy_mm + noise), start)
     xyz = np.array([[getattr(each, axis).value for axis in "XYZ"] for each in network.points])
     models = [(adjusted_image(true, each.name), adjusted_image(result, each.name)) for each in network.images]
     in_camera = np.concatenate([(xyz - model.station) @ model.rotation.T for model, _ in models])
@@ -90,21 +76,19 @@ def board_sample(
 
 def film_sample(rng: np.random.Generator, points: Array, distance: float) -> tuple[Array, Array, Array]:
     """The same over a frame of film; places count in the frame of the true marks, by an affine interior orientation."""
-    truth = Truth()
-    network, start = simulated(rng, truth, points=points, free=dict.fromkeys(truth.distortion, np.inf))
+    truth = nets.Truth()
+    network, start = nets.simulated(rng, truth, points=points, free=dict.fromkeys(truth.distortion, np.inf))
     result = adjust(network, start)
-    marks = np.array([[result.value(Parameter.fiducial("K", id, axis)) for axis in "xy"] for id in FIDUCIALS])
-    true_marks = np.column_stack([np.array(list(FIDUCIALS.values())), np.ones(len(FIDUCIALS))])
+    marks = np.array([[result.value(Parameter.fiducial("K", id, axis)) for axis in "xy"] for id in nets.FIDUCIALS])
+    true_marks = np.column_stack([np.array(list(nets.FIDUCIALS.values())), np.ones(len(nets.FIDUCIALS))])
     film = np.linalg.lstsq(true_marks, marks, rcond=None)[0]
-    stations, attitudes = np.array(truth.stations), [rotation(*each) for each in truth.attitudes]
+    stations, attitudes = np.array(truth.stations), [nets.rotation(*each) for each in truth.attitudes]
     view = zip(stations, attitudes, strict=True)
     in_camera = np.concatenate([(points - station) @ turn.T for station, turn in view])
-    fitted = np.concatenate(
-        [adjusted_image(result, f"f{i}").camera_from_object(points)[0] for i in range(len(stations))]
-    )
+    fitted = np.concatenate([adjusted_image(result, one.name).camera_from_object(points)[0] for one in network.images])
     level = replace(truth, stations=((0.0, 0.0, 0.0),), attitudes=((0.0, 0.0, 0.0),))
     fixed = points_along((FILM_MM - [truth.x0, truth.y0]) / truth.c, distance)
-    places = camera_point(level, 0, fixed)
+    places = nets.camera_point(level, 0, fixed)
     where = places_after_alignment(projection(result, "K"), in_camera, fitted, fixed)
     where = np.linalg.solve(film[:2].T, (where - film[2]).T).T
     return result.projection_uncertainty("K", distance, places).covariance_mm2, where, places
@@ -132,7 +116,7 @@ def spread(samples: list[tuple[Array, Array, Array]]) -> float:
 
 
 def true_board(images: int) -> Adjustment:
-    return adjust(board_network(np.random.default_rng(11), images, 0.0, given_mm=5e-4))
+    return adjust(nets.board_network(np.random.default_rng(11), images, 0.0, given_mm=5e-4))
 
 
 def test_simulated_calibrations_scatter_as_it_says() -> None:
@@ -154,13 +138,13 @@ def test_three_hundred_boards_scatter_as_it_says(distance: float) -> None:
 def test_three_hundred_films_scatter_as_it_says(distance: float) -> None:
     """The marks' frame is given to 1 mm, and the standard deviations are some micrometres."""
     rng = np.random.default_rng(7)
-    points = field_points(rng, 40)
+    points = nets.field_points(rng, 40)
     assert 0.95 < spread([film_sample(rng, points, distance) for _ in range(300)]) < 1.05
 
 
 def test_the_datum_of_the_marks_has_no_part_in_it() -> None:
     rng = np.random.default_rng(2)
-    network, start = simulated(rng, points=field_points(rng, 40))
+    network, start = nets.simulated(rng, points=nets.field_points(rng, 40))
     result = adjust(network, start)
     sigma_mm = result.projection_uncertainty("K", 1500.0, FILM_MM).sigma_model_mm
     assert result.sigma(Parameter.interior("K", "x0")) > 0.3
@@ -174,13 +158,13 @@ def test_it_covers_the_picture_and_stops_where_the_lens_does() -> None:
     np.testing.assert_allclose(found.places_mm[[0, -1], [0, -1]], [(0.0, 0.0), (3.2, -2.4)])
     assert 300 < found.median_distance < 450
     assert np.isfinite(found.sigma_mm).all()
-    folding = adjust(set_camera(result.network, distortion=Distortion("opencv", {"k1": FREE})))
-    far = folding.projection_uncertainty(places_mm=np.array([(BOARD_TRUTH["x0"] + 9.0, 0.0)]))
+    folding = adjust(nets.set_camera(result.network, distortion=Distortion("opencv", {"k1": FREE})))
+    far = folding.projection_uncertainty(places_mm=np.array([(nets.BOARD_TRUTH["x0"] + 9.0, 0.0)]))
     assert np.isnan(far.sigma_mm).all()
 
 
 def test_the_larger_of_both_standard_deviations_is_shown() -> None:
-    found = adjust(board_network(np.random.default_rng(3), 6, 5e-4)).projection_uncertainty()
+    found = adjust(nets.board_network(np.random.default_rng(3), 6, 5e-4)).projection_uncertainty()
     assert found.sigma_clusters_mm is not None
     np.testing.assert_array_equal(found.sigma_mm, np.maximum(found.sigma_model_mm, found.sigma_clusters_mm))
 
@@ -196,9 +180,11 @@ def test_what_cannot_be_projected_is_stated(camera: str, distance: float, messag
 
 def test_the_frame_of_film_lies_about_its_middle() -> None:
     rng = np.random.default_rng(2)
-    network, start = simulated(rng)
-    found = adjust(set_camera(network, frame_mm=(2 * HALF_MM, 2 * HALF_MM)), start).projection_uncertainty()
-    np.testing.assert_allclose(found.places_mm[0, 0], (-HALF_MM, HALF_MM))
+    network, start = nets.simulated(rng)
+    found = adjust(
+        nets.set_camera(network, frame_mm=(2 * nets.HALF_MM, 2 * nets.HALF_MM)), start
+    ).projection_uncertainty()
+    np.testing.assert_allclose(found.places_mm[0, 0], (-nets.HALF_MM, nets.HALF_MM))
 
 
 QUANTITIES = ("c", "x0", "y0", "k1", "k2")
@@ -212,7 +198,7 @@ def scatter(result: Adjustment) -> np.ndarray:
 
 
 def drop_image(network: Network, image: str) -> Network:
-    left = keep_rows(network, lambda name, *_: name != image)
+    left = nets.keep_rows(network, lambda name, *_: name != image)
     return replace(left, images=tuple(each for each in network.images if each.name != image))
 
 
@@ -221,7 +207,7 @@ def values(result: Adjustment) -> list[float]:
 
 
 def test_it_is_the_jackknife_of_adjustments_without_one_picture_each() -> None:
-    network = board_network(np.random.default_rng(3), 6, 5e-4)
+    network = nets.board_network(np.random.default_rng(3), 6, 5e-4)
     left = np.array([values(adjust(drop_image(network, image.name))) for image in network.images])
     spread = np.sqrt(5 / 6 * ((left - left.mean(axis=0)) ** 2).sum(axis=0))
     np.testing.assert_allclose(scatter(adjust(network)), spread, rtol=0.03)
@@ -229,7 +215,7 @@ def test_it_is_the_jackknife_of_adjustments_without_one_picture_each() -> None:
 
 def test_prediction_errors_are_those_of_adjustments_without_a_fold() -> None:
     """Each picture is oriented anew by the camera of the others, held fixed."""
-    network = board_network(np.random.default_rng(3), 6, 5e-4)
+    network = nets.board_network(np.random.default_rng(3), 6, 5e-4)
     predicted = adjust(network).prediction_errors(3)
     assert predicted is not None
     names = [image.name for image in network.images]
@@ -239,7 +225,7 @@ def test_prediction_errors_are_those_of_adjustments_without_a_fold() -> None:
         lens = Distortion("opencv", {name: priors[name] for name in ("k1", "k2")})
         interior = {"principal_distance_mm": priors["c"], "x0_mm": priors["x0"], "y0_mm": priors["y0"]}
         for name in fold:
-            one = set_camera(network, **interior, distortion=lens)
+            one = nets.set_camera(network, **interior, distortion=lens)
             for each in one.images:
                 one = one if each.name == name else drop_image(one, each.name)
             squares = (adjust(one).residuals.v_mm ** 2).sum(axis=1) / 5e-4**2
@@ -247,7 +233,7 @@ def test_prediction_errors_are_those_of_adjustments_without_a_fold() -> None:
 
 
 def test_few_pictures_tell_no_scatter() -> None:
-    result = adjust(board_network(np.random.default_rng(1), 4, 5e-4))
+    result = adjust(nets.board_network(np.random.default_rng(1), 4, 5e-4))
     assert result.cluster_covariance_of([Parameter.interior("desk", "c")]) is None
     assert result.value(Parameter.interior("desk", "c")) == pytest.approx(2.7, abs=0.02)
 
@@ -255,19 +241,19 @@ def test_few_pictures_tell_no_scatter() -> None:
 @pytest.mark.parametrize(("given_mm", "unmodelled_mm", "sigma0"), [(1e-4, 4.9e-4, 1.0), (6e-4, 0.0, 5 / 6)])
 def test_it_is_what_the_marks_err_by_beyond_what_is_given(given_mm: float, unmodelled_mm: float, sigma0: float) -> None:
     """Of errors of 0.5 µm: what is left is known to 3 % from 550 redundant coordinates."""
-    result = adjust_unmodelled(board_network(np.random.default_rng(5), 6, 5e-4, given_mm=given_mm))
+    result = adjust_unmodelled(nets.board_network(np.random.default_rng(5), 6, 5e-4, given_mm=given_mm))
     assert result.unmodelled_mm == {"desk": pytest.approx(unmodelled_mm, rel=0.09)}
     assert result.sigma0 == pytest.approx(sigma0, rel=0.09)
 
 
 def test_what_is_wrong_with_a_picture_is_no_unmodelled_error_that_passes() -> None:
     """One of eight pictures is mirrored: that is refused, or said, and not taken for a lens that is a little poor."""
-    network = board_network(np.random.default_rng(7), 8, 5e-4, given_mm=1e-4)
+    network = nets.board_network(np.random.default_rng(7), 8, 5e-4, given_mm=1e-4)
     xy_mm = network.observations.xy_mm.copy()
     rows = [row for row, image in enumerate(network.observations.image) if image == "i3"]
-    xy_mm[rows, 0] = BOARD_FRAME_MM[0] - xy_mm[rows, 0]
+    xy_mm[rows, 0] = nets.BOARD_FRAME_MM[0] - xy_mm[rows, 0]
     try:
-        text = " ".join(adjust_unmodelled(set_observations(network, xy_mm=xy_mm)).warnings)
+        text = " ".join(adjust_unmodelled(nets.set_observations(network, xy_mm=xy_mm)).warnings)
     except AdjustmentError as error:
         text = str(error)
     assert "i3" in text
@@ -276,5 +262,5 @@ def test_what_is_wrong_with_a_picture_is_no_unmodelled_error_that_passes() -> No
 
 def test_an_implausible_one_is_a_warning() -> None:
     """Errors of 5 µm, a part in 800 of the diagonal of 4 mm: no lens leaves so much."""
-    result = adjust_unmodelled(board_network(np.random.default_rng(9), 6, 5e-3, given_mm=1e-4))
+    result = adjust_unmodelled(nets.board_network(np.random.default_rng(9), 6, 5e-3, given_mm=1e-4))
     assert any(re.search(r"are not modelled, one part in [78]\d\d of", warning) for warning in result.warnings)

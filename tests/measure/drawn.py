@@ -11,16 +11,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.sparse import csr_array
 
 from measure import FiducialOptions, FrameMeasurement, MarkFit, MarkMeasurement, Scan, Status, measure_fiducials
+from measure.boards import specs
 from measure.boards.measure import BoardMeasurement
-from measure.boards.specs import (
-    AprilGridSpec,
-    BoardSpec,
-    CharucoSpec,
-    ChessboardSpec,
-    CircleGridSpec,
-    SquareGridSpec,
-    aruco_dictionary,
-)
 from measure.marks.shapes import Bar, Disk, FiducialLayout, LayoutMark, Mark, MarkShape, Part, Ring, ring_cross
 from measure.results import Covariance
 from measure.scans.cache import WholePicture
@@ -100,9 +92,7 @@ def brute_picture(mark: MarkShape, pixel_from_mark: Array, width: int, height: i
     reach = int(np.ceil(5 * blur_px)) + 1
     corners = np.concatenate([corners_mm(part) for part in mark.parts])
     # No blur reaches farther from the mark: all else stays dark.
-    (col0, row0), (col1, row1) = (
-        np.clip(each, 0, (width, height)) for each in bounds_px(corners, pixel_from_mark, reach)
-    )
+    (col0, row0), (col1, row1) = (np.clip(xy, 0, (width, height)) for xy in bounds_px(corners, pixel_from_mark, reach))
     picture = np.zeros((height, width))
     moved = pixel_from_mark - np.array([[0, 0, col0], [0, 0, row0]])
     picture[row0:row1, col0:col1] = _brute_picture(mark, moved, col1 - col0, row1 - row0, blur_px, reach)
@@ -122,7 +112,7 @@ def _brute_picture(mark: MarkShape, pixel_from_mark: Array, width: int, height: 
     mark_from_pixel = np.linalg.inv(pixel_from_mark[:, :2])
     for part in mark.parts:
         first, last = (
-            np.clip(each + pad, 0, (cols, rows)) * POINTS for each in bounds_px(corners_mm(part), pixel_from_mark, 1)
+            np.clip(c + pad, 0, (cols, rows)) * POINTS for c in bounds_px(corners_mm(part), pixel_from_mark, 1)
         )
         col, row = (
             ((np.arange(a, b) + 0.5) / POINTS - 0.5 - pad - center).astype(np.float32)  # to a millionth of a pixel
@@ -145,9 +135,7 @@ def corners_mm(part: Part) -> Array:
         return np.asarray(part.center_mm) + reach * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
     if isinstance(part, Bar):
         ends, half = np.array([part.from_mm, part.to_mm]), part.line_mm
-        return np.concatenate(
-            [ends + offset for offset in ((-half, -half), (half, -half), (half, half), (-half, half))]
-        )
+        return np.concatenate([ends + off for off in ((-half, -half), (half, -half), (half, half), (-half, half))])
     return np.array(part.vertices_mm)
 
 
@@ -308,7 +296,7 @@ def mapped(homography: Array, points: Array) -> Array:
     return np.asarray(np.stack([x / w, y / w], axis=-1))
 
 
-def take_picture(spec: BoardSpec, homography: Array, is_dark: Any, seed: int = 1) -> Array:
+def take_picture(spec: specs.BoardSpec, homography: Array, is_dark: Any, seed: int = 1) -> Array:
     """A board whose middle lies on the homography's origin; is_dark says so of board coordinates in mm."""
     middle = np.mean([point[:2] for point in spec.object_points().values()], axis=0)
 
@@ -321,7 +309,7 @@ def take_picture(spec: BoardSpec, homography: Array, is_dark: Any, seed: int = 1
     return 8000 + 30000 * clean + rng.normal(0, 300, clean.shape)
 
 
-def read_truth(spec: BoardSpec, homography: Array) -> dict[str, Array]:
+def read_truth(spec: specs.BoardSpec, homography: Array) -> dict[str, Array]:
     points = spec.object_points()
     flat = np.array([point[:2] for point in points.values()])
     places = mapped(np.asarray(np.linalg.inv(homography)), np.asarray(flat - flat.mean(axis=0)))
@@ -334,7 +322,7 @@ def errors_px(board: BoardMeasurement, truth: dict[str, Array]) -> Array:
     return np.asarray([np.asarray(mark.center_px) - truth[mark.point] for mark in measured_marks], float)
 
 
-def chessboard_dark(spec: ChessboardSpec) -> Any:
+def chessboard_dark(spec: specs.ChessboardSpec) -> Any:
     """Dark is the square whose upper left corner is r0c0, and every other one."""
 
     def dark(x: Array, y: Array) -> Array:
@@ -345,7 +333,7 @@ def chessboard_dark(spec: ChessboardSpec) -> Any:
     return dark
 
 
-def circles_dark(spec: CircleGridSpec) -> Any:
+def circles_dark(spec: specs.CircleGridSpec) -> Any:
     places = np.array([point[:2] for point in spec.object_points().values()])
 
     def dark(x: Array, y: Array) -> Array:
@@ -357,7 +345,7 @@ def circles_dark(spec: CircleGridSpec) -> Any:
     return dark
 
 
-def printed(board: Any, spec: BoardSpec, size_mm: tuple[float, float], corner_mm: Array) -> Any:
+def printed(board: Any, spec: specs.BoardSpec, size_mm: tuple[float, float], corner_mm: Array) -> Any:
     """Darkness from OpenCV's own drawing of a board, 4 px a mm, whose upper left corner lies at corner_mm."""
     drawing = board.generateImage((round(size_mm[0] * 4), round(size_mm[1] * 4)), marginSize=0, borderBits=1)
     return darkness(drawing, corner_mm)
@@ -375,11 +363,11 @@ def darkness(drawing: Any, corner_mm: Array) -> Any:
     return dark
 
 
-def charuco_picture(spec: CharucoSpec, homography: Array) -> Array:
+def charuco_picture(spec: specs.CharucoSpec, homography: Array) -> Array:
     """OpenCV's own drawing of a board, photographed."""
     count = spec.columns * spec.rows // 2
     numbers = np.arange(spec.first_id, spec.first_id + count)
-    size, dictionary = (spec.columns, spec.rows), aruco_dictionary(spec.dictionary)
+    size, dictionary = (spec.columns, spec.rows), specs.aruco_dictionary(spec.dictionary)
     drawing = cv2.aruco.CharucoBoard(size, spec.square_mm, spec.marker_mm, dictionary, numbers)
     drawing.setLegacyPattern(bool(spec.legacy))
     width, height = spec.columns * spec.square_mm, spec.rows * spec.square_mm
@@ -387,7 +375,7 @@ def charuco_picture(spec: CharucoSpec, homography: Array) -> Array:
     return take_picture(spec, homography, printed(drawing, spec, (width, height), corner))
 
 
-def april_grid_dark(spec: AprilGridSpec, quarter_turns: int = 0) -> Any:
+def april_grid_dark(spec: specs.AprilGridSpec, quarter_turns: int = 0) -> Any:
     """Kalibr's board of OpenCV's markers, each turned so often: squares at all corners, the first at the lower left."""
     side, gap = round(4 * spec.marker_mm), round(4 * spec.gap_mm)
     drawing = np.full((spec.rows * (side + gap) + gap, spec.columns * (side + gap) + gap), 255, np.uint8)
@@ -396,14 +384,14 @@ def april_grid_dark(spec: AprilGridSpec, quarter_turns: int = 0) -> Any:
         drawing[top : top + gap, left : left + gap] = 0
         if row < spec.rows and column < spec.columns:
             number = spec.first_marker + (spec.rows - 1 - row) * spec.columns + column
-            marker = cv2.aruco.generateImageMarker(aruco_dictionary(spec.dictionary), number, side, borderBits=2)
+            marker = cv2.aruco.generateImageMarker(specs.aruco_dictionary(spec.dictionary), number, side, borderBits=2)
             where = np.s_[top + gap : top + gap + side, left + gap : left + gap + side]
             drawing[where] = np.rot90(marker, quarter_turns)
     corner = np.array([-spec.gap_mm, spec.rows * (spec.marker_mm + spec.gap_mm)])
     return darkness(drawing, corner)
 
 
-def squares_dark(spec: SquareGridSpec) -> Any:
+def squares_dark(spec: specs.SquareGridSpec) -> Any:
     """Dark where both coordinates, from the lower left square's corner, lie in a square."""
     step = spec.square_mm + spec.gap_mm
 
@@ -414,7 +402,7 @@ def squares_dark(spec: SquareGridSpec) -> Any:
     return dark
 
 
-def tile_boards(spec: BoardSpec, is_dark: Any, shown: tuple[float, ...], fineness: int = 4) -> Array:
+def tile_boards(spec: specs.BoardSpec, is_dark: Any, shown: tuple[float, ...], fineness: int = 4) -> Array:
     """Boards of one kind side by side, upright, at 1 mm a pixel times the scale in which each is shown."""
     extent = np.ptp([point[:2] for point in spec.object_points().values()], axis=0) + 60.0
     width, height = int(extent[0]), int(extent[1])

@@ -9,13 +9,12 @@ import pytest
 from drawn import center, measured_mark
 from studies import parametrize_with_studies
 
-from measure import FiducialLayout, LayoutMark, MarkShape, cross
+from measure import Code, FiducialLayout, FrameMeasurement, LayoutMark, MarkShape, Pose, Reason, Status, cross
 from measure.fiducials.across_frames import CheckedFrames, check_frames
 from measure.fiducials.consistency import FrameMarks, frame_p_value
 from measure.fiducials.options import BelievedFilm
-from measure.flags import FALSE_DOUBT, Cause, Code, Reason, Status
+from measure.flags import FALSE_DOUBT, Cause
 from measure.geometry import UP_FROM_CAMERA
-from measure.results import FrameMeasurement, Pose
 
 PX_PER_MM, SIGMA_PX, FILM_MM = 50.0, 0.02, 0.003
 PITCH = (1000 / PX_PER_MM, 1000 / PX_PER_MM)
@@ -293,9 +292,7 @@ def test_film_that_scatters_more_than_expected_is_a_problem_of_all_frames() -> N
         result = check_network(frames)
         assert named(result) <= {("0", str(wrong))}
         assert all("state film_sigma_um" in frame.problems[-1] for frame in result.frames)
-        stated = check_frames(
-            frames, make_layout(FOUR), [(1000 / PX_PER_MM,) * 2] * 3, BelievedFilm(1.0, is_stated=True)
-        )
+        stated = check_frames(frames, make_layout(FOUR), [(1e3 / PX_PER_MM,) * 2] * 3, BelievedFilm(1, is_stated=True))
         assert not any(frame.problems for frame in stated.frames)
 
 
@@ -310,9 +307,7 @@ def test_of_four_good_marks_on_bent_film_none_is_called_wrong(count: int) -> Non
 
 
 @pytest.mark.parametrize("tilt_deg", [0.5, 1.0, 2.0, 5.0])
-def test_a_perspective_is_named_where_affine_films_are_stated_and_free_where_projective_ones_are(
-    tilt_deg: float,
-) -> None:
+def test_a_perspective_is_named_where_films_are_affine(tilt_deg: float) -> None:
     """Eight marks as a pinhole 600 mm away pictures them."""
     rng, tilt = np.random.default_rng(6), np.deg2rad(tilt_deg)
     x, y = np.array(EIGHT).T
@@ -335,8 +330,7 @@ def weaken(frame: FrameMeasurement, *numbers: int) -> FrameMeasurement:
     """The frame with some marks of the status weak."""
     reason = Reason("its contrast is low", Code.CONTRAST)
     marks = [
-        replace(mark, status=Status.WEAK, reason=reason) if number in numbers else mark
-        for number, mark in enumerate(frame.marks)
+        replace(mark, status=Status.WEAK, reason=reason) if i in numbers else mark for i, mark in enumerate(frame.marks)
     ]
     return replace(frame, marks=tuple(marks))
 

@@ -2,64 +2,44 @@
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import cv2
+import drawn as draw
 import numpy as np
 import pytest
-from drawn import (
-    HEIGHT,
-    WIDTH,
-    board_from_pixel,
-    chessboard_dark,
-    circles_dark,
-    draw,
-    errors_px,
-    make_scan,
-    mapped,
-    read_truth,
-    squares_dark,
-    take_picture,
-    tile_boards,
-)
 from numpy.typing import NDArray
 from real_data import DATA, needs
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
 from measure import Status, open_scan
+from measure.boards import specs
 from measure.boards.find import is_even, whole_pattern
+from measure.boards.markers import ReadMarkers, charuco_board, find_aruco, find_charuco, off_corners
 from measure.boards.measure import BoardMeasurement, measure_board, one_definition
-from measure.boards.specs import (
-    AprilGridSpec,
-    ArucoSpec,
-    BoardSpec,
-    CharucoSpec,
-    ChessboardSpec,
-    CircleGridSpec,
-    SquareGridSpec,
-)
 from measure.flags import Cause, Code
 from measure.results import Covariance, MarkMeasurement
 
 Array = NDArray[np.float64]
-CHESSBOARD = ChessboardSpec(6, 5, 24.0)
-SMALL_DOTS = CircleGridSpec(6, 5, 28.0, 13.0)
-SMALL_SQUARES = SquareGridSpec(6, 5, 16.0, 12.0)
-STAGGERED = CircleGridSpec(8, 6, 20.0, 13.0, asymmetric=True)
+CHESSBOARD = specs.ChessboardSpec(6, 5, 24.0)
+SMALL_DOTS = specs.CircleGridSpec(6, 5, 28.0, 13.0)
+SMALL_SQUARES = specs.SquareGridSpec(6, 5, 16.0, 12.0)
+STAGGERED = specs.CircleGridSpec(8, 6, 20.0, 13.0, asymmetric=True)
 
 
-def measure_picture(spec: BoardSpec, dark: Any, homography: Array) -> tuple[BoardMeasurement, Array]:
+def measure_picture(spec: specs.BoardSpec, dark: Any, homography: Array) -> tuple[BoardMeasurement, Array]:
     """And the errors of what is measured."""
-    board = measure_board(make_scan(take_picture(spec, homography, dark)), spec)
-    return board, errors_px(board, read_truth(spec, homography))
+    board = measure_board(draw.make_scan(draw.take_picture(spec, homography, dark)), spec)
+    return board, draw.errors_px(board, draw.read_truth(spec, homography))
 
 
 @pytest.mark.parametrize(
     "turn_deg", [*(pytest.param(turn, marks=pytest.mark.study) for turn in (4.0, 100.0, 275.0)), 187.0]
 )
 def test_a_chessboard_in_any_direction_keeps_its_names(turn_deg: float) -> None:
-    board, errors = measure_picture(CHESSBOARD, chessboard_dark(CHESSBOARD), board_from_pixel(turn_deg))
+    board, errors = measure_picture(CHESSBOARD, draw.chessboard_dark(CHESSBOARD), draw.board_from_pixel(turn_deg))
     assert board.reason == ""
     assert all(mark.status is Status.MEASURED for mark in board.marks)
     assert len(errors) == 30
@@ -68,17 +48,17 @@ def test_a_chessboard_in_any_direction_keeps_its_names(turn_deg: float) -> None:
 
 
 def test_trap_half_a_pixel_lost_in_a_search_at_a_reduced_size() -> None:
-    homography = board_from_pixel(3.0)
-    picture = take_picture(CHESSBOARD, homography, chessboard_dark(CHESSBOARD))
+    homography = draw.board_from_pixel(3.0)
+    picture = draw.take_picture(CHESSBOARD, homography, draw.chessboard_dark(CHESSBOARD))
     large = np.pad(np.kron(picture, np.ones((4, 4))), ((0, 0), (0, 1100)), constant_values=38000.0)
-    board = measure_board(make_scan(large), CHESSBOARD)
-    truth = {name: 4 * place + 1.5 for name, place in read_truth(CHESSBOARD, homography).items()}
-    assert np.abs(errors_px(board, truth).mean(axis=0)).max() < 0.04
+    board = measure_board(draw.make_scan(large), CHESSBOARD)
+    truth = {name: 4 * place + 1.5 for name, place in draw.read_truth(CHESSBOARD, homography).items()}
+    assert np.abs(draw.errors_px(board, truth).mean(axis=0)).max() < 0.04
 
 
 def test_a_board_that_a_half_turn_does_not_change_is_taken_as_upright_and_says_so() -> None:
-    spec = ChessboardSpec(6, 4, 24.0)
-    board, errors = measure_picture(spec, chessboard_dark(spec), board_from_pixel(10.0))
+    spec = specs.ChessboardSpec(6, 4, 24.0)
+    board, errors = measure_picture(spec, draw.chessboard_dark(spec), draw.board_from_pixel(10.0))
     assert "looks the same after a half turn" in board.notes[0]
     assert np.abs(errors).max() < 0.05
 
@@ -86,13 +66,13 @@ def test_a_board_that_a_half_turn_does_not_change_is_taken_as_upright_and_says_s
 @parametrize_with_studies(
     "spec",
     [
-        CircleGridSpec(6, 5, 30.0, 14.0),
-        CircleGridSpec(9, 7, 16.0, 14.0, asymmetric=True),
-        CircleGridSpec(8, 9, 24.0, 15.0, asymmetric=True, row_spacing_mm=13.9),
+        specs.CircleGridSpec(6, 5, 30.0, 14.0),
+        specs.CircleGridSpec(9, 7, 16.0, 14.0, asymmetric=True),
+        specs.CircleGridSpec(8, 9, 24.0, 15.0, asymmetric=True, row_spacing_mm=13.9),
     ],
 )
-def test_circle_grids(spec: CircleGridSpec) -> None:
-    board, errors = measure_picture(spec, circles_dark(spec), board_from_pixel(tilt=5e-5))
+def test_circle_grids(spec: specs.CircleGridSpec) -> None:
+    board, errors = measure_picture(spec, draw.circles_dark(spec), draw.board_from_pixel(tilt=5e-5))
     assert board.reason == ""
     assert len(errors) == len(spec.places())
     assert np.abs(errors).max() < 0.06
@@ -100,15 +80,18 @@ def test_circle_grids(spec: CircleGridSpec) -> None:
 
 @pytest.mark.parametrize(
     ("spec", "dark"),
-    [(CircleGridSpec(6, 5, 30.0, 14.0), circles_dark), (SquareGridSpec(5, 4, 20.0, 16.0), squares_dark)],
+    [
+        (specs.CircleGridSpec(6, 5, 30.0, 14.0), draw.circles_dark),
+        (specs.SquareGridSpec(5, 4, 20.0, 16.0), draw.squares_dark),
+    ],
 )
-def test_a_reflection_that_clips_the_light_side_of_edges_moves_no_point(spec: BoardSpec, dark: Any) -> None:
+def test_a_reflection_that_clips_the_light_side_of_edges_moves_no_point(spec: specs.BoardSpec, dark: Any) -> None:
     """Dark parts are lighter there as well, and fits of clipped values as of ordinary ones lay up to 1 px off."""
-    homography = board_from_pixel(tilt=5e-5)
-    col, row = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
-    glare = 45000 * np.exp(-((col - WIDTH / 2) ** 2 + (row - HEIGHT / 2) ** 2) / (2 * 30.0**2))
-    board = measure_board(make_scan(take_picture(spec, homography, dark(spec)) + glare), spec)
-    errors = errors_px(board, read_truth(spec, homography))
+    homography = draw.board_from_pixel(tilt=5e-5)
+    col, row = np.meshgrid(np.arange(draw.WIDTH), np.arange(draw.HEIGHT))
+    glare = 45000 * np.exp(-((col - draw.WIDTH / 2) ** 2 + (row - draw.HEIGHT / 2) ** 2) / (2 * 30.0**2))
+    board = measure_board(draw.make_scan(draw.take_picture(spec, homography, dark(spec)) + glare), spec)
+    errors = draw.errors_px(board, draw.read_truth(spec, homography))
     assert len(errors) >= 0.9 * len(spec.object_points())
     assert np.abs(errors).max() < 0.13
 
@@ -116,10 +99,10 @@ def test_a_reflection_that_clips_the_light_side_of_edges_moves_no_point(spec: Bo
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
 def test_a_tone_curve_moves_no_corner_of_separate_squares(gamma: float) -> None:
     """It shifts all edges by the same share of their blur, which the distances between squares show."""
-    spec, homography = SquareGridSpec(5, 4, 20.0, 16.0), board_from_pixel(tilt=5e-5)
-    light = take_picture(spec, homography, squares_dark(spec)) / 65535
-    board = measure_board(make_scan(65535 * np.maximum(light, 0.0) ** (1 / gamma)), spec)
-    errors = errors_px(board, read_truth(spec, homography))
+    spec, homography = specs.SquareGridSpec(5, 4, 20.0, 16.0), draw.board_from_pixel(tilt=5e-5)
+    light = draw.take_picture(spec, homography, draw.squares_dark(spec)) / 65535
+    board = measure_board(draw.make_scan(65535 * np.maximum(light, 0.0) ** (1 / gamma)), spec)
+    errors = draw.errors_px(board, draw.read_truth(spec, homography))
     assert len(errors) == len(spec.object_points())
     assert np.sqrt(np.mean(errors**2)) < 0.03
     claims = [mark.covariance.sigmas_px for mark in board.marks if mark.covariance is not None]
@@ -129,29 +112,29 @@ def test_a_tone_curve_moves_no_corner_of_separate_squares(gamma: float) -> None:
 @pytest.mark.parametrize(("left_px", "cut"), [(-3, 1), (10, 2)])
 def test_dots_that_the_edge_of_the_picture_cuts_are_not_measured(left_px: int, cut: int) -> None:
     """left_px: edge beside the centre of the first dot, whose radius is 7 px."""
-    spec, homography = CircleGridSpec(6, 5, 30.0, 14.0), board_from_pixel(20.0, tilt=5e-5)
-    truth = read_truth(spec, homography)
+    spec, homography = specs.CircleGridSpec(6, 5, 30.0, 14.0), draw.board_from_pixel(20.0, tilt=5e-5)
+    truth = draw.read_truth(spec, homography)
     left = round(truth["r0c0"][0]) + left_px
-    board = measure_board(make_scan(take_picture(spec, homography, circles_dark(spec))[:, left:]), spec)
+    board = measure_board(draw.make_scan(draw.take_picture(spec, homography, draw.circles_dark(spec))[:, left:]), spec)
     outside = [mark for mark in board.marks if mark.reason.codes == (Code.OUTSIDE,)]
     assert [(mark.point, mark.status) for mark in outside] == [(f"r{row}c0", Status.ABSENT) for row in range(cut)]
-    errors = errors_px(board, {name: place - [left, 0] for name, place in truth.items()})
+    errors = draw.errors_px(board, {name: place - [left, 0] for name, place in truth.items()})
     assert len(errors) == 30 - cut
     assert np.abs(errors).max() < 0.06
 
 
 @pytest.mark.parametrize("is_mirrored", [False, True])
 def test_an_asymmetric_grid_in_a_mirror_keeps_its_names(is_mirrored: bool) -> None:
-    spec, homography = CircleGridSpec(8, 6, 20.0, 15.0, asymmetric=True), board_from_pixel(tilt=5e-5)
-    picture, truth = take_picture(spec, homography, circles_dark(spec)), read_truth(spec, homography)
+    spec, homography = specs.CircleGridSpec(8, 6, 20.0, 15.0, asymmetric=True), draw.board_from_pixel(tilt=5e-5)
+    picture, truth = draw.take_picture(spec, homography, draw.circles_dark(spec)), draw.read_truth(spec, homography)
     if is_mirrored:
         picture = picture[:, ::-1]
         truth = {name: np.array([picture.shape[1] - 1, 0]) + place * (-1, 1) for name, place in truth.items()}
-    board = measure_board(make_scan(picture), spec)
+    board = measure_board(draw.make_scan(picture), spec)
     assert (board.reason, board.is_mirrored) == ("", is_mirrored)
-    errors = errors_px(board, truth)
+    errors = draw.errors_px(board, truth)
     half_turned = dict(zip(truth, reversed(truth.values()), strict=True))
-    assert min(np.abs(errors).max(), np.abs(errors_px(board, half_turned)).max()) < 0.06
+    assert min(np.abs(errors).max(), np.abs(draw.errors_px(board, half_turned)).max()) < 0.06
 
 
 @parametrize_with_studies(
@@ -166,19 +149,19 @@ def test_an_asymmetric_grid_in_a_mirror_keeps_its_names(is_mirrored: bool) -> No
     quick=(2,),
 )
 def test_a_chessboard_of_another_count_is_refused_with_its_own(columns: int, rows: int, words: str) -> None:
-    picture = take_picture(CHESSBOARD, board_from_pixel(8.0, 6e-4), chessboard_dark(CHESSBOARD))
-    board = measure_board(make_scan(picture), ChessboardSpec(columns, rows, 24.0))
+    picture = draw.take_picture(CHESSBOARD, draw.board_from_pixel(8.0, 6e-4), draw.chessboard_dark(CHESSBOARD))
+    board = measure_board(draw.make_scan(picture), specs.ChessboardSpec(columns, rows, 24.0))
     assert words in board.reason
     assert {mark.status for mark in board.marks} == {Status.ABSENT}
 
 
-LARGE = ChessboardSpec(9, 6, 24.0)
+LARGE = specs.ChessboardSpec(9, 6, 24.0)
 
 
 @pytest.fixture(scope="module")
 def large_board() -> tuple[Array, dict[str, Array]]:
-    homography = board_from_pixel(8.0, 3e-4)
-    return take_picture(LARGE, homography, chessboard_dark(LARGE)), read_truth(LARGE, homography)
+    homography = draw.board_from_pixel(8.0, 3e-4)
+    return draw.take_picture(LARGE, homography, draw.chessboard_dark(LARGE)), draw.read_truth(LARGE, homography)
 
 
 @parametrize_with_studies(
@@ -186,14 +169,12 @@ def large_board() -> tuple[Array, dict[str, Array]]:
     [(np.s_[:, 60:], 51), (np.s_[:, :250], 48), (np.s_[:190, :], 45), (np.s_[80:, 70:], 40), (np.s_[:180, :240], 39)],
     quick=(3,),
 )
-def test_a_part_of_a_chessboard_has_the_names_of_the_whole(
-    large_board: tuple[Array, dict[str, Array]], shown: Any, count: int
-) -> None:
+def test_a_part_is_named_as_the_whole(large_board: tuple[Array, dict[str, Array]], shown: Any, count: int) -> None:
     """Its light border is seen on two sides or more; the colours tell which end is which."""
     picture, truth = large_board
-    board = measure_board(make_scan(picture[shown]), LARGE)
-    errors = errors_px(
-        board, {name: place - [shown[1].start or 0, shown[0].start or 0] for name, place in truth.items()}
+    board = measure_board(draw.make_scan(picture[shown]), LARGE)
+    errors = draw.errors_px(
+        board, {id: place - [shown[1].start or 0, shown[0].start or 0] for id, place in truth.items()}
     )
     assert len(errors) == count
     assert np.abs(errors).max() < 0.03
@@ -205,7 +186,7 @@ def test_a_part_of_a_chessboard_has_the_names_of_the_whole(
 def test_what_covers_a_chessboard_is_no_end_of_it(large_board: tuple[Array, dict[str, Array]], covered: Any) -> None:
     picture, truth = large_board[0].copy(), large_board[1]
     picture[covered] = 22000.0
-    errors = errors_px(measure_board(make_scan(picture), LARGE), truth)
+    errors = draw.errors_px(measure_board(draw.make_scan(picture), LARGE), truth)
     assert len(errors) >= 45
     assert np.abs(errors).max() < 0.03
 
@@ -216,7 +197,7 @@ def test_corners_at_the_edges_of_shadows_are_not_measured(large_board: tuple[Arr
     row, col = np.indices(picture.shape, float)
     across = 0.8 * col + 0.6 * row
     shade = 0.5 + 0.5 * np.tanh(4.0 * np.sin(2 * np.pi * across / 24.0))
-    board = measure_board(make_scan(picture * np.where(col < 130, 1 - 0.6 * shade, 1.0)), LARGE)
+    board = measure_board(draw.make_scan(picture * np.where(col < 130, 1 - 0.6 * shade, 1.0)), LARGE)
     found = {mark.point: mark.center_px for mark in board.marks if mark.center_px is not None}
     off = {point: float(np.hypot(*(center_px - truth[point]))) for point, center_px in found.items()}
     measured = {mark.point for mark in board.marks if mark.status is Status.MEASURED}
@@ -230,39 +211,33 @@ def test_corners_at_the_edges_of_shadows_are_not_measured(large_board: tuple[Arr
 def test_strong_sharpening_makes_no_corner_weak(large_board: tuple[Array, dict[str, Array]]) -> None:
     """As much is left unexplained as by a shadow, but alike on both sides."""
     picture, truth = large_board
-    board = measure_board(make_scan(picture + 3.0 * (picture - gaussian_filter(picture, 1.5)) + 20000.0), LARGE)
+    board = measure_board(draw.make_scan(picture + 3.0 * (picture - gaussian_filter(picture, 1.5)) + 20000.0), LARGE)
     assert all(mark.status is Status.MEASURED for mark in board.marks)
-    assert np.abs(errors_px(board, truth)).max() < 0.1
+    assert np.abs(draw.errors_px(board, truth)).max() < 0.1
 
 
 @parametrize_with_studies("shown", [np.s_[80:, 150:], np.s_[:, 60:250], np.s_[80:, 60:250]])
-def test_a_part_of_a_chessboard_that_may_be_another_is_refused(
-    large_board: tuple[Array, dict[str, Array]], shown: Any
-) -> None:
+def test_a_part_that_may_be_another_is_refused(large_board: tuple[Array, dict[str, Array]], shown: Any) -> None:
     """Of one corner's border with fewer squares than tell the longer side; and without an end of the longer side."""
-    board = measure_board(make_scan(large_board[0][shown]), LARGE)
+    board = measure_board(draw.make_scan(large_board[0][shown]), LARGE)
     assert not any(mark.status.is_observation for mark in board.marks)
     assert "nothing tells which part it is" in board.reason
 
 
 @parametrize_with_studies("covered_mm", [28.0, 31.0, 34.0], quick=(1,))
-def test_the_edge_of_what_covers_a_board_is_not_where_its_squares_end(
-    large_board: tuple[Array, dict[str, Array]], covered_mm: float
-) -> None:
+def test_a_covers_edge_is_not_where_squares_end(large_board: tuple[Array, dict[str, Array]], covered_mm: float) -> None:
     """Two columns are covered as lightly as paper, to beside the third at 48 mm, and two lie outside of the picture."""
     picture, truth = large_board[0].copy(), large_board[1]
     col, row = np.indices(picture.T.shape, float)
-    x, _ = mapped(board_from_pixel(8.0, 3e-4), np.stack([col, row], axis=-1).reshape(-1, 2)).T
+    x, _ = draw.mapped(draw.board_from_pixel(8.0, 3e-4), np.stack([col, row], axis=-1).reshape(-1, 2)).T
     picture[covered_mm > x.reshape(col.shape).T + 96.0] = 38000.0
     end = int(min(truth[f"r{row}c7"][0] for row in range(LARGE.rows))) - 4
-    board = measure_board(make_scan(picture[:, :end]), LARGE)
+    board = measure_board(draw.make_scan(picture[:, :end]), LARGE)
     assert not any(mark.status.is_observation for mark in board.marks)
 
 
-def test_a_board_whose_outer_corners_lie_outside_is_refused_in_words_that_fit(
-    large_board: tuple[Array, dict[str, Array]],
-) -> None:
-    board = measure_board(make_scan(large_board[0][:195, 52:256]), LARGE)
+def test_a_board_with_corners_outside_is_refused_in_fitting_words(large_board: tuple[Array, dict[str, Array]]) -> None:
+    board = measure_board(draw.make_scan(large_board[0][:195, 52:256]), LARGE)
     assert not any(mark.status.is_observation for mark in board.marks)
     assert "9 x 6 inner corners is whole in the scan: some of its corners, or of the light border" in board.reason
 
@@ -271,8 +246,8 @@ def test_a_board_whose_outer_corners_lie_outside_is_refused_in_words_that_fit(
 def test_lines_of_a_board_are_evenly_spaced_under_one_homography(left_out: int | None) -> None:
     """Of a lens with 6 % of distortion at the corner, seen at an angle; one line left out shows, wherever it is."""
     column, row = np.meshgrid(np.arange(9.0), np.arange(7.0))
-    x, y = mapped(
-        np.array([[60.0, 4, 60], [-3, 58, 50], [2e-2, 3e-2, 1]]), np.stack([column, row], axis=-1).reshape(-1, 2)
+    x, y = draw.mapped(
+        np.array([[60, 4, 60], [-3, 58, 50], [0.02, 0.03, 1]]), np.stack([column, row], -1).reshape(-1, 2)
     ).T
     about = np.stack([x - 320, y - 240], axis=-1)
     grid = np.array([320, 240]) + about * (1 - 0.06 * (about**2).sum(axis=1, keepdims=True) / 400**2)
@@ -285,9 +260,9 @@ def test_lines_of_a_board_are_evenly_spaced_under_one_homography(left_out: int |
 
 def test_a_pattern_grows_to_where_it_ends() -> None:
     """From a part of its lines; a line along its border is none of it, and one that the picture cuts is no end."""
-    homography = board_from_pixel(5.0, 4e-4)
-    picture = (take_picture(CHESSBOARD, homography, chessboard_dark(CHESSBOARD)) / 256).astype(np.uint8)
-    grid = np.array(list(read_truth(CHESSBOARD, homography).values())).reshape(5, 6, 2)
+    homography = draw.board_from_pixel(5.0, 4e-4)
+    picture = (draw.take_picture(CHESSBOARD, homography, draw.chessboard_dark(CHESSBOARD)) / 256).astype(np.uint8)
+    grid = np.array(list(draw.read_truth(CHESSBOARD, homography).values())).reshape(5, 6, 2)
     part = whole_pattern(picture, grid[1:4, :4])
     assert part is not None
     assert part.grid.shape == grid.shape
@@ -303,8 +278,8 @@ def test_a_pattern_grows_to_where_it_ends() -> None:
 @parametrize_with_studies(("turn_deg", "gap_mm"), [(-25.0, 18.0), (7.0, 9.0)], quick=(1,))
 def test_corners_of_separate_squares(turn_deg: float, gap_mm: float) -> None:
     """Named by row, column and corner, to some hundredths of a pixel, their standard deviations honest."""
-    spec = SquareGridSpec(5, 4, 45.0 - gap_mm, gap_mm)
-    board, errors = measure_picture(spec, squares_dark(spec), board_from_pixel(turn_deg, 2e-4))
+    spec = specs.SquareGridSpec(5, 4, 45.0 - gap_mm, gap_mm)
+    board, errors = measure_picture(spec, draw.squares_dark(spec), draw.board_from_pixel(turn_deg, 2e-4))
     assert board.notes == ("the grid looks the same when turned: it was taken as upright in the scan",)
     assert len(errors) >= 78
     assert np.sqrt(np.mean(errors**2)) < 0.03
@@ -317,18 +292,18 @@ def test_corners_of_separate_squares(turn_deg: float, gap_mm: float) -> None:
 @parametrize_with_studies(
     ("spec", "dark", "words"),
     [
-        (CHESSBOARD, chessboard_dark(CHESSBOARD), "3 boards of 6 x 5 inner corners"),
-        (SMALL_DOTS, circles_dark(SMALL_DOTS), "3 grids of 6 x 5 dots"),
-        (SMALL_SQUARES, squares_dark(SMALL_SQUARES), "3 boards of 6 x 5 squares"),
-        (STAGGERED, circles_dark(STAGGERED), "3 grids of 24 dots in 6 rows"),
+        (CHESSBOARD, draw.chessboard_dark(CHESSBOARD), "3 boards of 6 x 5 inner corners"),
+        (SMALL_DOTS, draw.circles_dark(SMALL_DOTS), "3 grids of 6 x 5 dots"),
+        (SMALL_SQUARES, draw.squares_dark(SMALL_SQUARES), "3 boards of 6 x 5 squares"),
+        (STAGGERED, draw.circles_dark(STAGGERED), "3 grids of 24 dots in 6 rows"),
     ],
 )
-def test_of_boards_that_are_alike_none_is_observed(spec: BoardSpec, dark: Any, words: str) -> None:
+def test_of_boards_that_are_alike_none_is_observed(spec: specs.BoardSpec, dark: Any, words: str) -> None:
     """Neither by their size, for nobody knows how far away they are; the reason says how many, and where."""
-    one = measure_board(make_scan(tile_boards(spec, dark, (1.0,))), spec)
+    one = measure_board(draw.make_scan(draw.tile_boards(spec, dark, (1.0,))), spec)
     assert not one.ambiguous
     assert all(mark.status is Status.MEASURED for mark in one.marks)
-    three = measure_board(make_scan(tile_boards(spec, dark, (1.0, 0.9, 1.0))), spec)
+    three = measure_board(draw.make_scan(draw.tile_boards(spec, dark, (1.0, 0.9, 1.0))), spec)
     assert words in three.ambiguous
     places = [float(place) for place in re.findall(r"\((\d+), \d+\)", three.ambiguous)]
     width = np.ptp([point[:2] for point in spec.object_points().values()], axis=0)[0] + 60.0
@@ -345,14 +320,14 @@ def test_a_board_of_less_than_half_the_size_is_another_one() -> None:
         dark = np.pad(np.kron(squares, np.ones((side, side))), side, constant_values=1)
         picture[top : top + dark.shape[0], left : left + dark.shape[1]] = 25 + 200 * dark
     blurred = np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.8), float) + rng.normal(0, 2, picture.shape)
-    board = measure_board(make_scan(blurred, 255), ChessboardSpec(9, 6, 30.0))
+    board = measure_board(draw.make_scan(blurred, 255), specs.ChessboardSpec(9, 6, 30.0))
     assert "2 boards of 9 x 6 inner corners" in board.ambiguous
     assert {mark.status for mark in board.marks} == {Status.REJECTED}
 
 
 def test_a_circle_grid_is_no_part_of_a_larger_one() -> None:
-    larger = CircleGridSpec(7, 5, 28.0, 13.0)
-    board = measure_board(make_scan(tile_boards(larger, circles_dark(larger), (1.0,))), SMALL_DOTS)
+    larger = specs.CircleGridSpec(7, 5, 28.0, 13.0)
+    board = measure_board(draw.make_scan(draw.tile_boards(larger, draw.circles_dark(larger), (1.0,))), SMALL_DOTS)
     assert "the grid is larger than 6 x 5 dots" in board.reason
     assert {mark.status for mark in board.marks} == {Status.ABSENT}
 
@@ -364,28 +339,28 @@ def test_a_few_spots_are_no_circle_grid() -> None:
     def light(col: Array, row: Array) -> Array:
         return np.asarray(np.min([np.hypot(col - x, row - y) for x, y in places], axis=0) > 8.0, float)
 
-    scan = make_scan(8000 + 30000 * draw(light, 340, 250, 0.8, fineness=4))
+    scan = draw.make_scan(8000 + 30000 * draw.draw(light, 340, 250, 0.8, fineness=4))
     board = measure_board(scan, SMALL_DOTS)
     assert "no grid of 6 x 5 dots is whole in the scan; 5 spots are candidates for dots" in board.reason
-    board = measure_board(scan, CircleGridSpec(8, 11, 28.0, 12.0, asymmetric=True))
+    board = measure_board(scan, specs.CircleGridSpec(8, 11, 28.0, 12.0, asymmetric=True))
     assert "no grid of 44 dots in 11 rows is whole in the scan" in board.reason  # 4 x 11, as OpenCV counts
 
 
 @pytest.mark.parametrize(
     "spec",
     [
-        ChessboardSpec(9, 6, 25.0),
-        CircleGridSpec(6, 5, 30.0, 14.0),
-        ArucoSpec("4X4_50", 3, 2, 30.0, 10.0),
-        AprilGridSpec("APRILTAG_36h11", 3, 2, 30.0, 9.0),
-        CharucoSpec("4X4_50", 6, 5, 32.0, 24.0),
-        SquareGridSpec(6, 5, 25.0, 15.0),
+        specs.ChessboardSpec(9, 6, 25.0),
+        specs.CircleGridSpec(6, 5, 30.0, 14.0),
+        specs.ArucoSpec("4X4_50", 3, 2, 30.0, 10.0),
+        specs.AprilGridSpec("APRILTAG_36h11", 3, 2, 30.0, 9.0),
+        specs.CharucoSpec("4X4_50", 6, 5, 32.0, 24.0),
+        specs.SquareGridSpec(6, 5, 25.0, 15.0),
     ],
 )
 @pytest.mark.parametrize("level", [0.0, 30.0])
-def test_why_a_board_was_not_found(spec: BoardSpec, level: float) -> None:
+def test_why_a_board_was_not_found(spec: specs.BoardSpec, level: float) -> None:
     rng = np.random.default_rng(3)
-    board = measure_board(make_scan(level + rng.normal(0, level / 10, (480, 640))), spec)
+    board = measure_board(draw.make_scan(level + rng.normal(0, level / 10, (480, 640))), spec)
     assert board.reason
     assert {mark.point for mark in board.marks} == set(spec.object_points())
     assert all(mark.status is Status.ABSENT and mark.reason for mark in board.marks)
@@ -394,13 +369,13 @@ def test_why_a_board_was_not_found(spec: BoardSpec, level: float) -> None:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: ChessboardSpec(2, 6, 25.0), "columns is 2"),
-        (lambda: ChessboardSpec(9, 6, 0.0), "square_mm"),
-        (lambda: CircleGridSpec(6, 5, 10.0, 12.0), "dots less than"),
-        (lambda: CharucoSpec("4X4_50", 6, 5, 20.0, 24.0), "less than the square's"),
-        (lambda: SquareGridSpec(6, 5, 25.0, 0.0), "gap_mm"),
-        (lambda: ArucoSpec("4X4_49", 3, 2, 30.0, 10.0), "one of"),
-        (lambda: ArucoSpec("4X4_50", 3, 2, 30.0, 10.0, first_marker=47), "0 to 49"),
+        (lambda: specs.ChessboardSpec(2, 6, 25.0), "columns is 2"),
+        (lambda: specs.ChessboardSpec(9, 6, 0.0), "square_mm"),
+        (lambda: specs.CircleGridSpec(6, 5, 10.0, 12.0), "dots less than"),
+        (lambda: specs.CharucoSpec("4X4_50", 6, 5, 20.0, 24.0), "less than the square's"),
+        (lambda: specs.SquareGridSpec(6, 5, 25.0, 0.0), "gap_mm"),
+        (lambda: specs.ArucoSpec("4X4_49", 3, 2, 30.0, 10.0), "one of"),
+        (lambda: specs.ArucoSpec("4X4_50", 3, 2, 30.0, 10.0, first_marker=47), "0 to 49"),
     ],
 )
 def test_bad_specifications_are_refused(make: Any, words: str) -> None:
@@ -429,7 +404,7 @@ THREE_SIGMA = np.array([0.402, 0.431, 0.819, 0.749, 0.00314, 0.0125, 0.000169, 0
 
 def chessboards(numbers: Iterable[int]) -> tuple[list[Array], list[Array]]:
     """The points on the board, and where some of the published pictures show them."""
-    spec = ChessboardSpec(13, 12, 30.0)
+    spec = specs.ChessboardSpec(13, 12, 30.0)
     boards = []
     for number in numbers:
         with open_scan(DATA / "chessboards" / "bouguet" / f"Image{number}.tif") as scan:
@@ -458,7 +433,238 @@ def test_published_calibration_of_a_chessboard() -> None:
 @pytest.mark.study
 @needs("circles", "boofcv")
 def test_hexagonal_circle_grids_of_another_project() -> None:
-    spec = CircleGridSpec(24, 28, 1.2 * np.sqrt(3) / 2, 1.0, asymmetric=True, row_spacing_mm=0.6)
+    spec = specs.CircleGridSpec(24, 28, 1.2 * np.sqrt(3) / 2, 1.0, asymmetric=True, row_spacing_mm=0.6)
     with open_scan(DATA / "circles" / "boofcv" / "Sony_DSC-HX5V_CircleHexagonal" / "image01.jpg") as scan:
         board = measure_board(scan, spec)
     assert sum(mark.status.is_observation for mark in board.marks) >= 334
+
+
+APRIL_GRID = specs.AprilGridSpec("APRILTAG_36h11", 3, 2, 66.0, 20.0, first_marker=5)
+
+
+@pytest.mark.parametrize("turn_deg", [5.0, 95.0])
+def test_trap_charuco_corners_shifted_by_half_a_pixel(turn_deg: float) -> None:
+    spec = specs.CharucoSpec("4X4_50", 6, 5, 32.0, 24.0)
+    drawing = cv2.aruco.CharucoBoard((6, 5), 32.0, 24.0, specs.aruco_dictionary("4X4_50"))
+    homography = draw.board_from_pixel(turn_deg, 2e-4)
+    corner = np.array([-32.0, 4 * 32.0])
+    picture = draw.take_picture(spec, homography, draw.printed(drawing, spec, (192, 160), corner))
+    board = measure_board(draw.make_scan(picture), spec)
+    errors = draw.errors_px(board, draw.read_truth(spec, homography))
+    assert len(errors) >= 16
+    assert np.abs(errors).max() < 0.06
+    assert np.abs(errors.mean(axis=0)).max() < 0.01
+
+
+def generated(spec: specs.CharucoSpec) -> NDArray[np.uint8]:
+    """OpenCV's own picture of a board, 20 px a square, with a margin of one square."""
+    size = (20 * (spec.columns + 2), 20 * (spec.rows + 2))
+    picture = charuco_board(spec).generateImage(size, marginSize=20)
+    return np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.7), np.uint8)
+
+
+def test_a_wrong_side_of_the_markers_is_named_with_the_right_one() -> None:
+    picture = np.full((280, 360), 255, np.uint8)
+    for row, column in np.ndindex(3, 4):
+        marker = cv2.aruco.generateImageMarker(specs.aruco_dictionary("4X4_50"), 4 * row + column, 60)
+        picture[30 + 80 * row : 90 + 80 * row, 30 + 80 * column : 90 + 80 * column] = marker
+    assert len(find_aruco(picture, specs.ArucoSpec("4X4_50", 4, 3, 30.0, 10.0)).corners) == 48
+    found = find_aruco(picture, specs.ArucoSpec("4X4_50", 4, 3, 25.0, 15.0))
+    assert not found.corners
+    side = re.search(r"its side is about (\S+) mm against the distances, 25 mm being described", found.reason)
+    assert side is not None
+    assert float(side[1]) == pytest.approx(30.0, rel=0.03)  # read to a pixel of 60
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_the_markers_tell_the_layout_of_a_charuco_board(legacy: bool) -> None:
+    """Without a given layout each corner has the name of its place; a layout that the markers contradict is refused."""
+    spec = specs.CharucoSpec("4X4_50", 6, 4, 32.0, 24.0, legacy=legacy)
+    picture = generated(spec)
+    found = find_charuco(picture, replace(spec, legacy=None)).corners
+    assert len(found) == 15
+    for name, corner in found.items():
+        row, column = divmod(int(name[1:]), 5)
+        np.testing.assert_allclose(corner.center_px, (39.5 + 20 * column, 39.5 + 20 * row), atol=0.5)
+    refused = find_charuco(picture, replace(spec, legacy=not legacy))
+    assert not refused.corners
+    assert f"but as with legacy = {str(legacy).lower()}" in refused.reason
+
+
+def test_a_charuco_board_of_which_one_line_of_corners_is_visible_is_not_placed() -> None:
+    """All of it but two rows of squares is covered: one line had ended in a traceback."""
+    spec = specs.CharucoSpec("4X4_50", 6, 4, 32.0, 24.0)
+    drawing = charuco_board(spec).generateImage((400, 300), marginSize=50)
+    tilt = np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 4e-4, 1.0]])
+    picture = np.asarray(cv2.warpPerspective(drawing, tilt, (400, 300), borderValue=(255,)), np.uint8)
+    picture[145:] = 255
+    board = find_charuco(picture, spec)
+    assert not board.corners
+    assert "only 5 corners of one line were found" in board.reason
+
+
+def test_exchanged_counts_and_another_first_number_at_once() -> None:
+    """Each alone does not make the markers agree; both together are named."""
+    spec = specs.CharucoSpec("4X4_50", 6, 5, 32.0, 24.0, first_id=9)
+    board = find_charuco(generated(spec), replace(spec, columns=5, rows=6, first_id=0))
+    assert not board.corners
+    assert "but as with columns = 6, rows = 5, first_id = 9." in board.reason
+    inner = find_charuco(generated(spec), replace(spec, columns=5, rows=4))
+    assert "but as with columns = 6, rows = 5." in inner.reason
+    aruco = specs.ArucoSpec("4X4_50", 4, 3, 20.0, 8.0, first_marker=5)
+    picture = cv2.aruco.GridBoard((4, 3), 20.0, 8.0, specs.aruco_dictionary("4X4_50"), np.arange(5, 17))
+    drawing = np.asarray(picture.generateImage((344, 264), marginSize=20), np.uint8)
+    read = find_aruco(drawing, replace(aruco, columns=3, rows=4, first_marker=0))
+    assert "but as with columns = 4, rows = 3, first_marker = 5." in read.reason
+    assert len(find_aruco(drawing, aruco).corners) == 48
+
+
+@pytest.mark.parametrize("first", [0, 5])
+def test_markers_counted_from_below_are_those_of_an_aprilgrid(first: int) -> None:
+    """And the other way round: the kind that fits is named, with its own keys."""
+    grid = specs.AprilGridSpec("APRILTAG_36h11", 4, 3, 40.0, 12.0, first_marker=first)
+    above = specs.ArucoSpec("APRILTAG_36h11", 4, 3, 40.0, 12.0, first_marker=first)
+    for drawn, taken, words in (
+        (grid, above, 'but as with kind = "aprilgrid", spacing = 0.3.'),
+        (above, grid, 'but as with kind = "aruco", gap_mm = 12.'),
+    ):
+        picture = np.full((3 * 52 + 40, 4 * 52 + 40), 255, np.uint8)
+        for row, column in np.ndindex(3, 4):
+            marker = cv2.aruco.generateImageMarker(
+                specs.aruco_dictionary(drawn.dictionary), drawn.marker(row, column), 40
+            )
+            picture[20 + 52 * row : 60 + 52 * row, 20 + 52 * column : 60 + 52 * column] = marker
+        board = find_aruco(picture, taken)
+        assert not board.corners
+        assert words in board.reason
+        assert len(find_aruco(picture, drawn).corners) == 48
+
+
+def test_charuco_numbers_that_begin_later() -> None:
+    """Shifted by two rows of markers, all would lie as on a board that begins at 0."""
+    spec = specs.CharucoSpec("4X4_50", 6, 5, 32.0, 24.0, first_id=6)
+    homography = draw.board_from_pixel(4.0, 2e-4)
+    picture = draw.charuco_picture(spec, homography)
+    board = measure_board(draw.make_scan(picture), spec)
+    errors = draw.errors_px(board, draw.read_truth(spec, homography))
+    assert len(errors) >= 16
+    assert np.abs(errors).max() < 0.06
+    assert "but as with first_id = 6" in measure_board(draw.make_scan(picture), replace(spec, first_id=0)).reason
+    assert "but as with first_id = 6" in measure_board(draw.make_scan(picture), replace(spec, first_id=30)).reason
+
+
+def test_a_charuco_corner_is_held_against_the_markers_next_to_it() -> None:
+    """One a square off, as another crossing would be, is named; where no marker beside it was read, nothing tells."""
+    spec = specs.CharucoSpec("4X4_50", 6, 5, 32.0, 24.0)
+    homography = draw.board_from_pixel(3.0, 1e-4)
+    points, truth = spec.object_points(), draw.read_truth(spec, homography)
+    outline = np.array([(-12.0, 12.0), (12.0, 12.0), (12.0, -12.0), (-12.0, -12.0)])
+    middle = np.mean([point[:2] for point in points.values()], axis=0)
+    marker = outline + np.array(points["c2"][:2]) - middle + 16.0  # in the square between c2 and c3
+    read = ReadMarkers({1: draw.mapped(np.asarray(np.linalg.inv(homography)), marker)}, {}, 1)
+    found = {name: specs.FoundCorner(truth[name], 32 * np.eye(2)) for name in ("c2", "c3", "c19")}
+    assert off_corners(found, spec, read) == {}
+    found["c2"] = specs.FoundCorner(truth["c7"], 32 * np.eye(2))
+    assert "1.0 squares from the place that the adjacent markers give" in off_corners(found, spec, read)["c2"]
+
+
+@parametrize_with_studies("dictionary", ["5X5_100", "APRILTAG_36h11"], quick=(1,))
+def test_aruco_and_apriltag_corners(dictionary: str) -> None:
+    spec = specs.ArucoSpec(dictionary, 3, 2, 63.0, 21.0, first_marker=7)
+    drawing = cv2.aruco.GridBoard((3, 2), 63.0, 21.0, specs.aruco_dictionary(dictionary), np.arange(7, 13))
+    homography = draw.board_from_pixel(4.0, 1e-4)
+    picture = draw.take_picture(spec, homography, draw.printed(drawing, spec, (231, 147), np.array([0.0, 147.0])))
+    board = measure_board(draw.make_scan(picture), spec)
+    errors = draw.errors_px(board, draw.read_truth(spec, homography))
+    assert len(errors) == 24
+    assert np.sqrt(np.mean(errors**2)) < 0.03
+
+
+@parametrize_with_studies(("turn_deg", "quarter_turns"), [(4.0, 0), (184.0, 2)], quick=(1,))
+def test_a_grid_of_april_tags_has_its_corners_at_the_junctions(turn_deg: float, quarter_turns: int) -> None:
+    """Counted from the lower left, however each tag is turned; two modules of border, squares at all corners."""
+    homography = draw.board_from_pixel(turn_deg, 1e-4)
+    picture = draw.take_picture(APRIL_GRID, homography, draw.april_grid_dark(APRIL_GRID, quarter_turns))
+    board = measure_board(draw.make_scan(picture), APRIL_GRID)
+    errors = draw.errors_px(board, draw.read_truth(APRIL_GRID, homography))
+    assert len(errors) == 24
+    assert np.sqrt(np.mean(errors**2)) < 0.03
+    assert np.abs(errors.mean(axis=0)).max() < 0.008
+    assert all("junction_col_px" in mark.quality for mark in board.marks)
+    other = measure_board(draw.make_scan(picture), replace(APRIL_GRID, first_marker=0))
+    assert "but as with first_id = 5" in other.reason
+
+
+@parametrize_with_studies("kind", ["aprilgrid", "charuco", "aruco"], quick=(2,))
+def test_a_board_in_a_mirror_keeps_its_names(kind: str) -> None:
+    """As it is seen from its back; what was read in the picture as it is, of another board's number, is none of it."""
+    spec: specs.ArucoSpec | specs.CharucoSpec = APRIL_GRID
+    homography = draw.board_from_pixel(5.0, 1e-4)
+    if kind == "charuco":
+        spec = specs.CharucoSpec("4X4_50", 6, 5, 32.0, 24.0)
+        picture = draw.charuco_picture(spec, homography)
+    elif kind == "aruco":
+        spec = specs.ArucoSpec("5X5_100", 3, 2, 63.0, 21.0)
+        drawing = cv2.aruco.GridBoard((3, 2), 63.0, 21.0, specs.aruco_dictionary("5X5_100"))
+        picture = draw.take_picture(spec, homography, draw.printed(drawing, spec, (231, 147), np.array([0.0, 147.0])))
+    else:
+        picture = draw.take_picture(spec, homography, draw.april_grid_dark(APRIL_GRID))
+    truth = draw.read_truth(spec, homography)
+    board = measure_board(draw.make_scan(picture[:, ::-1]), spec)
+    assert board.is_mirrored
+    errors = draw.errors_px(board, {name: np.array([draw.WIDTH - 1 - col, row]) for name, (col, row) in truth.items()})
+    assert len(errors) >= 16
+    assert np.sqrt(np.mean(errors**2)) < 0.03
+
+
+@pytest.mark.parametrize("name", ["aruco", "charuco"])
+def test_a_marker_read_twice_is_the_one_where_its_board_has_it(name: str) -> None:
+    """A stray copy of one marker is passed over; of two like boards none is measured, and the reason says why."""
+    dictionary = specs.aruco_dictionary("4X4_50")
+    spec: specs.ArucoSpec | specs.CharucoSpec
+    if name == "aruco":
+        spec = specs.ArucoSpec("4X4_50", 3, 2, 60.0, 20.0)
+        drawing = cv2.aruco.GridBoard((3, 2), 60.0, 20.0, dictionary).generateImage((260, 180), marginSize=20)
+    else:
+        spec = specs.CharucoSpec("4X4_50", 5, 4, 48.0, 36.0)
+        drawing = cv2.aruco.CharucoBoard((5, 4), 48.0, 36.0, dictionary).generateImage((260, 212), marginSize=10)
+    height, width = drawing.shape
+    picture = np.full((height + 40, 2 * width + 60), 255.0)
+    picture[20 : 20 + height, 20 : 20 + width] = drawing
+    two = picture.copy()
+    picture[60:120, width + 100 : width + 160] = cv2.aruco.generateImageMarker(dictionary, 3, 60)
+    two[20 : 20 + height, width + 40 : 2 * width + 40] = drawing
+    half = np.full_like(picture, 255.0)
+    half[20 : 20 + height, 20 : 20 + width] = drawing
+    half[20 : 20 + height, width + 40 + width // 2 : 2 * width + 40] = drawing[:, width // 2 :]
+
+    def measure_picture(grey: Array) -> BoardMeasurement:
+        noise = np.random.default_rng(2).normal(0, 300, grey.shape)
+        return measure_board(draw.make_scan(8000 + 120 * cv2.GaussianBlur(grey, (0, 0), 0.8) + noise), spec)
+
+    measured_marks = [mark.center_px for mark in measure_picture(picture).marks if mark.status is Status.MEASURED]
+    assert len(measured_marks) == len(spec.object_points())
+    assert max(center[0] for center in measured_marks if center is not None) < width + 20
+    neither = measure_picture(two)
+    assert "was read at 2 places" in neither.reason
+    assert all(mark.status is Status.ABSENT for mark in neither.marks)
+    both = measure_picture(half)
+    assert all(mark.status is Status.MEASURED for mark in both.marks)
+    assert "of which one lies on the board: there may be another such board" in both.refused[0]
+
+
+@pytest.mark.parametrize("gap", [60.0, 130.0])
+def test_markers_of_two_boards_are_not_those_of_one(gap: float) -> None:
+    """Of one board the right column is seen, of another one the left: together they look like a board that is squeezed,
+    and nobody knows which of them is meant."""
+    spec = specs.ArucoSpec("4X4_50", 4, 4, 48.0, 16.0)
+    picture = np.full((296, 110 + int(gap)), 255.0)
+    for row in range(4):
+        top = 20 + 64 * row
+        for number, left in ((4 * row + 3, 10), (4 * row, 48 + int(gap))):
+            marker = cv2.aruco.generateImageMarker(specs.aruco_dictionary("4X4_50"), number, 48)
+            picture[top : top + 48, left : left + 48] = marker
+    noise = np.random.default_rng(2).normal(0, 300, picture.shape)
+    board = measure_board(draw.make_scan(8000 + 120 * cv2.GaussianBlur(picture, (0, 0), 0.8) + noise), spec)
+    assert "do not agree on where the board lies" in board.reason
+    assert all(mark.status is Status.ABSENT for mark in board.marks)

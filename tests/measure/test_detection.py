@@ -40,10 +40,7 @@ def places(seed: int) -> Array:
 
 def detect_marks(grey: Array, predicted: Array) -> list[FaintMark | None]:
     scan = make_scan(grey)
-    return [
-        detect_faint(scan, MarkPrediction(CROSS, np.column_stack([LINEAR, place]), 3.0, -1), 0.0, 0.7)
-        for place in predicted
-    ]
+    return [detect_faint(scan, MarkPrediction(CROSS, np.column_stack([LINEAR, xy]), 3, -1), 0, 0.7) for xy in predicted]
 
 
 def test_a_cross_of_the_grounds_own_contrast_is_measured_with_an_honest_sigma() -> None:
@@ -141,9 +138,7 @@ def test_what_the_tone_curve_moves_a_faint_mark_by_is_in_its_covariance() -> Non
     assert ends[1] is not None
     half = (ends[1].fit.center_px - ends[0].fit.center_px) / 2
     assert np.hypot(*half) > 1e-4
-    np.testing.assert_allclose(
-        detection.fit.place_covariance.parts[Cause.TONE], np.outer(half, half), rtol=0.25, atol=2e-7
-    )
+    np.testing.assert_allclose(detection.fit.place_covariance.parts[Cause.TONE], np.outer(half, half), 0.25, 2e-7)
     np.testing.assert_allclose(detection.fit.center_px, ends[0].fit.center_px + half, atol=0.002)
     assert Cause.TONE not in ends[0].fit.place_covariance.parts
 

@@ -2,86 +2,62 @@
 
 from dataclasses import replace
 
+import drawn as draw
 import numpy as np
 import pytest
-from drawn import (
-    ALIKE,
-    CORNERS,
-    FRAME_PX,
-    NOISE_DN,
-    NUMBERED,
-    PX_PER_MM,
-    RING_CROSS,
-    assert_right,
-    center,
-    found_pose,
-    frame_picture,
-    lay_out,
-    measure_grey,
-    paint,
-    pixel_from_camera,
-)
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
-from measure import Code, FiducialOptions, Status
+from measure import Code, FiducialOptions, MarkShape, Status, dot, polygon, ring_cross
 from measure.geometry import POSES
-from measure.marks.shapes import (
-    Disk,
-    MarkShape,
-    Part,
-    dot,
-    finest_detail_mm,
-    polygon,
-    ring_cross,
-)
+from measure.marks.shapes import Disk, Part, finest_detail_mm
 
 
 @parametrize_with_studies("pose", POSES, quick=(0, 7))
 def test_identification_dots_decide_each_of_eight_poses(pose: str) -> None:
-    matrix = pixel_from_camera(pose)
-    result = measure_grey(frame_picture(NUMBERED, matrix), NUMBERED)
-    assert found_pose(result) == (pose, True), result.pose
-    assert_right(result, NUMBERED, matrix)
+    matrix = draw.pixel_from_camera(pose)
+    result = draw.measure_grey(draw.frame_picture(draw.NUMBERED, matrix), draw.NUMBERED)
+    assert draw.found_pose(result) == (pose, True), result.pose
+    draw.assert_right(result, draw.NUMBERED, matrix)
     assert result.pixel_from_camera is not None
     np.testing.assert_allclose(result.pixel_from_camera, matrix, atol=0.02)
     assert result.problems == ()
 
 
 def test_like_marks_leave_the_pose_assumed_and_say_so() -> None:
-    matrix = pixel_from_camera("0")
-    result = measure_grey(frame_picture(ALIKE, matrix), ALIKE)
-    assert found_pose(result) == ("0", False)
+    matrix = draw.pixel_from_camera("0")
+    result = draw.measure_grey(draw.frame_picture(draw.ALIKE, matrix), draw.ALIKE)
+    assert draw.found_pose(result) == ("0", False)
     assert result.pose
     assert "alike" in result.pose.evidence[0]
-    assert_right(result, ALIKE, matrix)
+    draw.assert_right(result, draw.ALIKE, matrix)
 
 
 def test_writing_next_to_one_mark_names_no_pose() -> None:
     """Three dots beside a mark of a camera whose first mark has none, and whose others have one to three."""
-    matrix = pixel_from_camera("0")
-    grey = frame_picture(ALIKE, matrix)
-    paint(grey, MarkShape(tuple(Disk((1.0, 0.3 * k - 0.3), 0.08) for k in range(3))), CORNERS[1], matrix, 9000.0)
-    result = measure_grey(grey, NUMBERED)
-    assert not found_pose(result)[1], result.pose
+    matrix = draw.pixel_from_camera("0")
+    grey = draw.frame_picture(draw.ALIKE, matrix)
+    draw.paint(
+        grey, MarkShape(tuple(Disk((1.0, 0.3 * k - 0.3), 0.08) for k in range(3))), draw.CORNERS[1], matrix, 9000.0
+    )
+    result = draw.measure_grey(grey, draw.NUMBERED)
+    assert not draw.found_pose(result)[1], result.pose
 
 
 def test_what_covers_a_dot_and_resembles_a_smaller_one_is_doubted() -> None:
     dot, speck = MarkShape((Disk((0.0, 0.0), 0.4),)), MarkShape((Disk((0.01, -0.015), 0.34),))
-    matrix = pixel_from_camera("0")
-    given = lay_out([dot] * 4)
-    result = measure_grey(frame_picture(lay_out([dot, dot, dot, speck]), matrix), given)
+    matrix = draw.pixel_from_camera("0")
+    given = draw.lay_out([dot] * 4)
+    result = draw.measure_grey(draw.frame_picture(draw.lay_out([dot, dot, dot, speck]), matrix), given)
     assert [mark.status for mark in result.marks] == [Status.MEASURED] * 3 + [Status.WEAK]
     assert "0.85 times as large as the other marks" in result.marks[3].reason
 
 
 @pytest.mark.parametrize(("mark", "is_coarse"), [(ring_cross(0.5, 0.1, 0.8, 0.1), True), (dot(0.4), False)])
-def test_a_scan_without_a_frame_says_if_its_pixels_are_large_for_the_marks(
-    mark: tuple[Part, ...], is_coarse: bool
-) -> None:
+def test_a_scan_without_a_frame_says_if_its_pixels_are_large(mark: tuple[Part, ...], is_coarse: bool) -> None:
     """Lines of 0.1 mm at 50 µm a pixel are 2 px wide, a dot of 0.8 mm is 16 px wide."""
     grain = np.random.default_rng(5).normal(8000.0, 200.0, (400, 400))
-    (problem,) = measure_grey(grain, lay_out([MarkShape(mark)] * 4)).problems
+    (problem,) = draw.measure_grey(grain, draw.lay_out([MarkShape(mark)] * 4)).problems
     coarse = "the finest detail of the marks, 100 µm, is 2.0 px wide. Scan at 33 µm or finer."
     assert (coarse in problem, Code.SMALL in problem.codes) == (is_coarse, is_coarse)
 
@@ -96,12 +72,12 @@ def test_the_finest_detail_of_an_outline_is_an_edge_and_no_piece_of_an_arc() -> 
 @pytest.mark.study
 def test_a_frame_without_a_mark_free_of_blemish_has_no_settled_pose() -> None:
     """A part of every ring and cross is gone; the identification dots are all there."""
-    matrix = pixel_from_camera("90")
-    grey = frame_picture(NUMBERED, matrix)
-    for mark in NUMBERED.marks:
+    matrix = draw.pixel_from_camera("90")
+    grey = draw.frame_picture(draw.NUMBERED, matrix)
+    for mark in draw.NUMBERED.marks:
         col, row = np.rint(matrix @ (*mark.xy_mm, 1.0)).astype(int)
         grey[row + 1 : row + 20, col - 18 : col + 17] = 3000
-    result = measure_grey(grey, NUMBERED)
+    result = draw.measure_grey(grey, draw.NUMBERED)
     assert {mark.status for mark in result.marks} == {Status.WEAK}
     assert result.pose is not None
     assert (result.pose.name, result.pose.decided) == ("90", False)
@@ -109,18 +85,18 @@ def test_a_frame_without_a_mark_free_of_blemish_has_no_settled_pose() -> None:
 
 
 def test_the_users_pose_is_taken() -> None:
-    matrix = pixel_from_camera("270m")
-    result = measure_grey(frame_picture(ALIKE, matrix), ALIKE, FiducialOptions(pose="270m"))
+    matrix = draw.pixel_from_camera("270m")
+    result = draw.measure_grey(draw.frame_picture(draw.ALIKE, matrix), draw.ALIKE, FiducialOptions(pose="270m"))
     assert result.pose is not None
     assert (result.pose.name, result.pose.decided, result.pose.evidence) == ("270m", True, ("set in the project.",))
-    assert_right(result, ALIKE, matrix)
+    draw.assert_right(result, draw.ALIKE, matrix)
     assert result.problems == ()
 
 
 def test_a_pose_of_the_user_that_the_picture_contradicts_is_reported() -> None:
-    matrix = pixel_from_camera("90m")
-    result = measure_grey(frame_picture(NUMBERED, matrix), NUMBERED, FiducialOptions(pose="0"))
-    assert found_pose(result) == ("0", True)
+    matrix = draw.pixel_from_camera("90m")
+    result = draw.measure_grey(draw.frame_picture(draw.NUMBERED, matrix), draw.NUMBERED, FiducialOptions(pose="0"))
+    assert draw.found_pose(result) == ("0", True)
     assert any(
         "pose 0 is set in the project, but the marks of this frame show 90m" in problem
         and "identification dots" in problem
@@ -129,31 +105,31 @@ def test_a_pose_of_the_user_that_the_picture_contradicts_is_reported() -> None:
 
 
 def test_marks_places_decide_where_they_are_not_symmetric() -> None:
-    uneven = lay_out([MarkShape(RING_CROSS)] * 4, ((7.0, -7.0), (-7.0, -7.0), (-7.0, 6.0), (6.5, 7.0)))
-    matrix = pixel_from_camera("90")
-    result = measure_grey(frame_picture(uneven, matrix), uneven)
-    assert found_pose(result) == ("90", True), result.pose
-    assert_right(result, uneven, matrix)
+    uneven = draw.lay_out([MarkShape(draw.RING_CROSS)] * 4, ((7.0, -7.0), (-7.0, -7.0), (-7.0, 6.0), (6.5, 7.0)))
+    matrix = draw.pixel_from_camera("90")
+    result = draw.measure_grey(draw.frame_picture(uneven, matrix), uneven)
+    assert draw.found_pose(result) == ("90", True), result.pose
+    draw.assert_right(result, uneven, matrix)
 
 
 def test_dark_marks_and_an_unknown_pitch() -> None:
-    matrix = pixel_from_camera("0")
-    result = measure_grey(20000 - frame_picture(NUMBERED, matrix), NUMBERED, pitch=False)
-    assert found_pose(result)[0] == "0"
-    assert_right(result, NUMBERED, matrix)
+    matrix = draw.pixel_from_camera("0")
+    result = draw.measure_grey(20000 - draw.frame_picture(draw.NUMBERED, matrix), draw.NUMBERED, pitch=False)
+    assert draw.found_pose(result)[0] == "0"
+    draw.assert_right(result, draw.NUMBERED, matrix)
 
 
 def test_a_negative_of_light_marks_is_named() -> None:
-    negative = 20000 - frame_picture(NUMBERED, pixel_from_camera("0"))
-    light = [replace(mark, mark=replace(mark.mark, polarity="light")) for mark in NUMBERED.marks]
-    lost = measure_grey(negative, replace(NUMBERED, marks=tuple(light)), FiducialOptions(pose="0"))
+    negative = 20000 - draw.frame_picture(draw.NUMBERED, draw.pixel_from_camera("0"))
+    light = [replace(mark, mark=replace(mark.mark, polarity="light")) for mark in draw.NUMBERED.marks]
+    lost = draw.measure_grey(negative, replace(draw.NUMBERED, marks=tuple(light)), FiducialOptions(pose="0"))
     assert 'no negative of what the camera file draws (polarity = "auto" takes both)' in lost.problems[0]
 
 
 def test_zero_marks_give_no_silent_identity() -> None:
     rng = np.random.default_rng(5)
     for grey in (np.full((300, 300), 700.0), 8000 + rng.normal(0, 2000, (400, 400))):
-        result = measure_grey(grey, ALIKE)
+        result = draw.measure_grey(grey, draw.ALIKE)
         assert result.pixel_from_camera is None
         assert {mark.status for mark in result.marks} == {Status.ABSENT}
         assert all(mark.center_px is None and mark.reason for mark in result.marks)
@@ -164,8 +140,8 @@ def test_zero_marks_give_no_silent_identity() -> None:
 
 @pytest.mark.study
 def test_the_scan_of_another_camera_is_refused_with_a_count() -> None:
-    smaller = lay_out([MarkShape(RING_CROSS)] * 4, ((5.6, -5.6), (-5.6, -5.9), (-4.9, 5.6), (5.8, 5.6)))
-    result = measure_grey(frame_picture(smaller, pixel_from_camera("0")), ALIKE)
+    smaller = draw.lay_out([MarkShape(draw.RING_CROSS)] * 4, ((5.6, -5.6), (-5.6, -5.9), (-4.9, 5.6), (5.8, 5.6)))
+    result = draw.measure_grey(draw.frame_picture(smaller, draw.pixel_from_camera("0")), draw.ALIKE)
     assert result.pixel_from_camera is None
     assert not any(mark.status.is_observation for mark in result.marks)
     assert "does not fit: only" in result.problems[0]
@@ -173,25 +149,25 @@ def test_the_scan_of_another_camera_is_refused_with_a_count() -> None:
 
 def test_predicted_marks_are_not_written_as_measured() -> None:
     """And an affine on three marks is not printed as good."""
-    matrix = pixel_from_camera("0")
-    grey = frame_picture(ALIKE, matrix)
-    col, row = np.rint(matrix @ (*CORNERS[2], 1.0)).astype(int)
+    matrix = draw.pixel_from_camera("0")
+    grey = draw.frame_picture(draw.ALIKE, matrix)
+    col, row = np.rint(matrix @ (*draw.CORNERS[2], 1.0)).astype(int)
     rng = np.random.default_rng(3)
-    grey[row - 30 : row + 31, col - 30 : col + 31] = 3000 + rng.normal(0, NOISE_DN, (61, 61))
-    result = measure_grey(grey, ALIKE)
+    grey[row - 30 : row + 31, col - 30 : col + 31] = 3000 + rng.normal(0, draw.NOISE_DN, (61, 61))
+    result = draw.measure_grey(grey, draw.ALIKE)
     covered = result.marks[2]
     assert covered.status is Status.PREDICTED
     assert covered.reason
     assert covered.covariance_px2 is None
-    np.testing.assert_allclose(center(covered), matrix @ (*CORNERS[2], 1.0), atol=0.3)
+    np.testing.assert_allclose(draw.center(covered), matrix @ (*draw.CORNERS[2], 1.0), atol=0.3)
     assert [mark.status.is_observation for mark in result.marks] == [True, True, False, True]
     assert any("no check" in problem for problem in result.problems)
 
 
 def test_a_mark_beyond_the_edge_is_absent() -> None:
-    six = lay_out([MarkShape(RING_CROSS)] * 6, (*CORNERS, (7.0, 0.0), (-7.0, 0.0)))
-    matrix = pixel_from_camera("0", center=(202.3, 123.0))
-    result = measure_grey(frame_picture(six, matrix), six)
+    six = draw.lay_out([MarkShape(draw.RING_CROSS)] * 6, (*draw.CORNERS, (7.0, 0.0), (-7.0, 0.0)))
+    matrix = draw.pixel_from_camera("0", center=(202.3, 123.0))
+    result = draw.measure_grey(draw.frame_picture(six, matrix), six)
     upper = [given.xy_mm[1] > 0 for given in six.marks]
     # Four marks of six lie as well on the other four: what is seen has no certain name.
     assert [mark.status for mark in result.marks] == [Status.ABSENT if up else Status.REJECTED for up in upper]
@@ -199,32 +175,32 @@ def test_a_mark_beyond_the_edge_is_absent() -> None:
 
 
 def test_the_neighbouring_frames_marks_are_not_taken_for_this_frames() -> None:
-    matrix = pixel_from_camera("0", turn_rad=0.0)
-    grey = frame_picture(ALIKE, matrix, size=540)
+    matrix = draw.pixel_from_camera("0", turn_rad=0.0)
+    grey = draw.frame_picture(draw.ALIKE, matrix, size=540)
     neighbour = matrix.copy()
-    neighbour[0, 2] += 18.5 * PX_PER_MM
-    for place in CORNERS[1:3]:  # its left marks reach into this scan, brighter than our own
-        paint(grey, MarkShape(RING_CROSS), place, neighbour, 14000.0)
-    result = measure_grey(grey, ALIKE)
-    assert_right(result, ALIKE, matrix)
+    neighbour[0, 2] += 18.5 * draw.PX_PER_MM
+    for place in draw.CORNERS[1:3]:  # its left marks reach into this scan, brighter than our own
+        draw.paint(grey, MarkShape(draw.RING_CROSS), place, neighbour, 14000.0)
+    result = draw.measure_grey(grey, draw.ALIKE)
+    draw.assert_right(result, draw.ALIKE, matrix)
 
 
 def test_of_two_whole_frames_in_a_scan_none_is_taken_in_silence() -> None:
-    matrix = pixel_from_camera("0")
-    grey = np.hstack([frame_picture(NUMBERED, matrix, seed) for seed in (1, 2)])
-    grey[:, FRAME_PX:] = gaussian_filter(grey[:, FRAME_PX:], 1.0)  # this one answers less
-    result = measure_grey(grey, NUMBERED)
-    assert found_pose(result) == ("0", False)
+    matrix = draw.pixel_from_camera("0")
+    grey = np.hstack([draw.frame_picture(draw.NUMBERED, matrix, seed) for seed in (1, 2)])
+    grey[:, draw.FRAME_PX :] = gaussian_filter(grey[:, draw.FRAME_PX :], 1.0)  # this one answers less
+    result = draw.measure_grey(grey, draw.NUMBERED)
+    assert draw.found_pose(result) == ("0", False)
     assert any("the scan shows another frame (20.0, " in text for text in result.problems)
 
 
 def test_a_mark_off_the_constellation_is_no_observation() -> None:
-    places = (*CORNERS, (0.0, -7.0), (0.0, 7.0))
-    marks = [MarkShape(RING_CROSS)] * 6
-    given = lay_out(marks, places)
-    moved = lay_out(marks, (*places[:5], (0.55, 7.0)))
-    matrix = pixel_from_camera("0")
-    result = measure_grey(frame_picture(moved, matrix), given)
+    places = (*draw.CORNERS, (0.0, -7.0), (0.0, 7.0))
+    marks = [MarkShape(draw.RING_CROSS)] * 6
+    given = draw.lay_out(marks, places)
+    moved = draw.lay_out(marks, (*places[:5], (0.55, 7.0)))
+    matrix = draw.pixel_from_camera("0")
+    result = draw.measure_grey(draw.frame_picture(moved, matrix), given)
     assert [mark.status for mark in result.marks[:5]] == [Status.MEASURED] * 5
     assert result.marks[5].status is Status.PREDICTED
     assert "no mark like its drawing within 6 px" in result.marks[5].reason
@@ -237,13 +213,13 @@ def test_a_mark_off_the_constellation_is_no_observation() -> None:
 def test_a_missing_mark_is_stated_to_be_hidden_only_where_its_ground_hides_it(blot_dn: float, said: str) -> None:
     """Nothing but the marks is dark in the scan, so that its darkest half per cent is lighter than they are."""
     places = [(7.0 * i, 7.0 * j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    dark = lay_out([MarkShape(RING_CROSS, "dark")] * 9, places)
-    matrix = pixel_from_camera("0")
-    grey = np.random.default_rng(3).normal(20000.0, NOISE_DN, (FRAME_PX, FRAME_PX))
+    dark = draw.lay_out([MarkShape(draw.RING_CROSS, "dark")] * 9, places)
+    matrix = draw.pixel_from_camera("0")
+    grey = np.random.default_rng(3).normal(20000.0, draw.NOISE_DN, (draw.FRAME_PX, draw.FRAME_PX))
     for given in dark.marks[:8]:
-        paint(grey, given.mark, given.xy_mm, matrix, -12000.0)
+        draw.paint(grey, given.mark, given.xy_mm, matrix, -12000.0)
     col, row = np.rint(matrix @ (*dark.marks[8].xy_mm, 1.0)).astype(int)
     grey[row - 30 : row + 31, col - 30 : col + 31] += blot_dn - 20000.0
-    result = measure_grey(np.clip(grey, 0.0, None), dark, FiducialOptions(pose="0"))
+    result = draw.measure_grey(np.clip(grey, 0.0, None), dark, FiducialOptions(pose="0"))
     assert [mark.status for mark in result.marks] == [*[Status.MEASURED] * 8, Status.PREDICTED]
     assert result.marks[8].reason.startswith(said)

@@ -4,30 +4,25 @@ from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import pytest
-from drawn import Array, center, chi_square, draw, lay_out, make_scan, pixel_from_camera, transformed
+from drawn import center, chi_square, draw, lay_out, make_scan, pixel_from_camera, transformed, whitened
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
+from scipy.stats import multivariate_normal
 from studies import parametrize_with_studies
 
-from measure import FiducialOptions, MarkFit, Status, measure_fiducials
-from measure.marks.shapes import (
-    Bar,
-    Disk,
-    FiducialLayout,
-    LayoutMark,
-    MarkShape,
-    Point,
-    Polygon,
-    frame_corner,
-    limit_to_crossings,
-    limit_to_frame,
-    turned_part,
-)
+from measure import FiducialOptions, MarkFit, ScanWindow, Status, measure_fiducials
+from measure.array_types import Single
+from measure.boards.corners import Corner, CornerStart, Surface, crossing, fit_corners, quarter
+from measure.marks import shapes
 from measure.matching.frame_edge import fit_frame_corner
+from measure.scans.jpeg import rounding_step_dn
 from measure.tone.curve import LINEAR, Tone, power
+
+Array = NDArray[np.float64]
 
 HALF_MM, WEDGE_MM, SIDES = 8.0, 7.0, ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 PIXEL_FROM_CAMERA = pixel_from_camera("90", turn_rad=0.03)
@@ -46,10 +41,10 @@ class Measured(NamedTuple):
     chi2: float
 
 
-def layout(vertices: tuple[Point, ...], at_mm: float) -> FiducialLayout:
+def layout(vertices: tuple[shapes.Point, ...], at_mm: float) -> shapes.FiducialLayout:
     """One to each side, drawn as on the right."""
     turns = [float(np.degrees(np.arctan2(up, right))) for right, up in SIDES]
-    marks = [MarkShape((turned_part(Polygon(vertices), turn),)) for turn in turns]
+    marks = [shapes.MarkShape((shapes.turned_part(shapes.Polygon(vertices), turn),)) for turn in turns]
     places = [(at_mm * x, at_mm * y) for x, y in SIDES]
     return lay_out(marks, places, (2 * HALF_MM, 2 * HALF_MM))
 
@@ -83,7 +78,7 @@ def light_profile(at_mm: float, is_notch: bool, blur_px: float) -> Array:
     return draw(exposed, 400, 400, blur_px, fineness=4)
 
 
-def measure_picture(camera: FiducialLayout, picture: Array) -> list[Measured]:
+def measure_picture(camera: shapes.FiducialLayout, picture: Array) -> list[Measured]:
     """What is measured of the marks in it, none of them damaged or in doubt."""
     result = measure_fiducials(make_scan(picture), camera, (50.0, 50.0), FiducialOptions(pose="90"))
     found = []
@@ -107,8 +102,8 @@ def measure_picture(camera: FiducialLayout, picture: Array) -> list[Measured]:
     quick=(1, 2),
     ids=["beyond", "with its border", "to the edge", "notch"],
 )
-def test_marks_at_the_border_are_measured_as_if_it_were_not_there(
-    vertices: tuple[Point, ...], at_mm: float, is_notch: bool
+def test_border_marks_are_measured_as_elsewhere(
+    vertices: tuple[shapes.Point, ...], at_mm: float, is_notch: bool
 ) -> None:
     for mark in measure_picture(layout(vertices, at_mm), scanned(at_mm, is_notch)):
         assert mark.off_px < 0.1
@@ -133,15 +128,15 @@ def test_a_notch_claims_no_more_than_the_landscape_in_it_allows() -> None:
 
 def test_what_is_known_of_a_drawing_ends_at_the_frame() -> None:
     (wedge, *_), (notch, *_) = (
-        limit_to_frame(layout(WEDGE, WEDGE_MM)).marks,
-        limit_to_frame(layout(NOTCH, HALF_MM)).marks,
+        shapes.limit_to_frame(layout(WEDGE, WEDGE_MM)).marks,
+        shapes.limit_to_frame(layout(NOTCH, HALF_MM)).marks,
     )
     inner = layout(((0.0, 0.0), (0.8, 0.3), (0.8, -0.3)), WEDGE_MM)
-    assert isinstance(wedge.mark, MarkShape)
-    assert isinstance(notch.mark, MarkShape)
+    assert isinstance(wedge.mark, shapes.MarkShape)
+    assert isinstance(notch.mark, shapes.MarkShape)
     assert wedge.mark.known_outline_mm[:, 0].max() == pytest.approx(0.9)
     assert notch.mark.known_outline_mm[:, 0].min() == pytest.approx(0.1)
-    assert limit_to_frame(inner) == inner
+    assert shapes.limit_to_frame(inner) == inner
 
 
 PX_PER_MM, SIZE, FINE = 20.0, 520, 4
@@ -177,9 +172,11 @@ def picture(seed: int, radius_mm: float = 0.0, neighbour: bool = False, negative
     return np.asarray(60000 - grey if negative else grey)
 
 
-def layout_frame_corner(radius_mm: float = 0.0) -> FiducialLayout:
-    marks = [LayoutMark(id, xy, (0.02, 0.02), frame_corner(xy, 5.0, radius_mm)) for id, xy in CORNERS.items()]
-    return FiducialLayout(tuple(marks), (2 * FRAME_CORNER_HALF_MM, 2 * FRAME_CORNER_HALF_MM))
+def layout_frame_corner(radius_mm: float = 0.0) -> shapes.FiducialLayout:
+    marks = [
+        shapes.LayoutMark(id, xy, (0.02, 0.02), shapes.frame_corner(xy, 5.0, radius_mm)) for id, xy in CORNERS.items()
+    ]
+    return shapes.FiducialLayout(tuple(marks), (2 * FRAME_CORNER_HALF_MM, 2 * FRAME_CORNER_HALF_MM))
 
 
 @parametrize_with_studies(
@@ -202,7 +199,7 @@ def test_no_corner_is_visible_in_a_landscape() -> None:
     land = 15000 + 3000 * gaussian_filter(np.random.default_rng(3).normal(0, 1, (400, 400)), 3.0) / 0.09
     start = np.column_stack([MATRIX[:, :2], (200.0, 200.0)])
     scan = make_scan(np.asarray(land))
-    corner = frame_corner((-10.0, 10.0), 5.0)
+    corner = shapes.frame_corner((-10.0, 10.0), 5.0)
     fit = fit_frame_corner(scan, corner, start, 10.0, 1)
     assert not fit.converged
     assert "edge of the frame" in fit.reason
@@ -210,7 +207,7 @@ def test_no_corner_is_visible_in_a_landscape() -> None:
 
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
 def test_a_corner_moves_with_the_tone_curve_as_its_edges_say(gamma: float) -> None:
-    corner = frame_corner((-10.0, 10.0), 5.0)
+    corner = shapes.frame_corner((-10.0, 10.0), 5.0)
     start = np.column_stack([MATRIX[:, :2], MATRIX @ (-10.0, 10.0, 1.0)])
     scan = make_scan(65535 * (picture(4) / 65535) ** (1 / gamma))
     tone = Tone(power(gamma), covariance=np.eye(5))
@@ -236,12 +233,12 @@ MIDDLE_PX, LINES_TURN = np.array([322.3, 317.8]), np.deg2rad(0.4)
 BRIGHT = {"0-0": (0.05, -0.1), "3-1": (-0.1, 0.05)}  # stars on crossings, mm beside them
 
 
-def line_layout(arm_mm: float = 2.5) -> FiducialLayout:
-    cross = MarkShape(
-        (Bar((-arm_mm, 0.0), (arm_mm, 0.0), LINE_MM), Bar((0.0, -arm_mm), (0.0, arm_mm), LINE_MM)), "dark"
+def line_layout(arm_mm: float = 2.5) -> shapes.FiducialLayout:
+    cross = shapes.MarkShape(
+        (shapes.Bar((-arm_mm, 0), (arm_mm, 0), LINE_MM), shapes.Bar((0, -arm_mm), (0, arm_mm), LINE_MM)), "dark"
     )
-    marks = (LayoutMark(name, xy, (0.002, 0.002), cross) for name, xy in places_mm().items())
-    return FiducialLayout(tuple(marks), (30.0, 30.0))
+    marks = (shapes.LayoutMark(name, xy, (0.002, 0.002), cross) for name, xy in places_mm().items())
+    return shapes.FiducialLayout(tuple(marks), (30.0, 30.0))
 
 
 def places_mm() -> dict[str, tuple[float, float]]:
@@ -284,12 +281,149 @@ def test_crossings_are_measured_with_claims_that_hold_and_those_under_stars_are_
 
 
 def test_lines_that_run_on_are_known_about_their_crossings_only() -> None:
-    (limited, *_) = limit_to_crossings(line_layout()).marks
-    assert isinstance(limited.mark, MarkShape)
+    (limited, *_) = shapes.limit_to_crossings(line_layout()).marks
+    assert isinstance(limited.mark, shapes.MarkShape)
     assert limited.mark.known_mm == ((-1.0, -1.0), (1.0, 1.0))
     assert np.abs(limited.mark.known_outline_mm).max() <= 1.0
-    assert limit_to_crossings(line_layout(2.0)) == line_layout(2.0)  # crosses with gaps between them
+    assert shapes.limit_to_crossings(line_layout(2.0)) == line_layout(2.0)  # crosses with gaps between them
     dots = replace(
-        line_layout(), marks=tuple(replace(m, mark=MarkShape((Disk((0.0, 0.0), 2.4),))) for m in line_layout().marks)
+        line_layout(),
+        marks=tuple(replace(m, mark=shapes.MarkShape((shapes.Disk((0.0, 0.0), 2.4),))) for m in line_layout().marks),
     )
-    assert limit_to_crossings(dots) == dots
+    assert shapes.limit_to_crossings(dots) == dots
+
+
+CORNER_SIZE, NOISE, CORNER_CONTRAST = 25, 4.0, 100.0
+
+
+@pytest.mark.parametrize("correlation", [-0.7, 0.0, 0.4])
+@pytest.mark.parametrize("surface", [crossing, quarter])
+def test_the_closed_form_and_its_derivatives(correlation: float, surface: Surface) -> None:
+    rng = np.random.default_rng(1)
+    u, v = rng.normal(0, 2, (2, 6))
+    both = [multivariate_normal([0, 0], [[1, correlation], [correlation, 1]]).cdf(place) for place in np.c_[u, v]]
+    truth = 4 * np.array(both) - 2 * ndtr(u) - 2 * ndtr(v) + 1 if surface is crossing else 2 * np.array(both) - 1
+    value, *slopes = surface(*singles(u, v, correlation))
+    np.testing.assert_allclose(value[0], truth, atol=2e-6)
+    e = 0.02
+    steps = ((e, 0, 0), (0, e, 0), (0, 0, e))
+    for slope, (du, dv, dc) in zip(slopes, steps, strict=True):
+        ahead, behind = (surface(*singles(u + s * du, v + s * dv, correlation + s * dc))[0] for s in (1, -1))
+        np.testing.assert_allclose(slope, (ahead - behind) / (2 * e), atol=5e-4)
+
+
+def singles(u: Array, v: Array, correlation: float) -> tuple[Single, Single, Single]:
+    """Of one corner, in single precision."""
+    return u[None].astype(np.float32), v[None].astype(np.float32), np.array([[correlation]], np.float32)
+
+
+def board_steps(rng: np.random.Generator) -> Array:
+    """Sides of a square seen at an angle."""
+    first = rng.uniform(0, np.pi)
+    second = first + np.pi / 2 + rng.uniform(-0.4, 0.4)
+    return np.array([[np.cos(first), np.cos(second)], [np.sin(first), np.sin(second)]]) * (16.0, 14.0)
+
+
+def square_picture(center: Array, steps: Array, blur_px: float, alone: bool) -> Array:
+    """Squares about a corner, light between the steps; alone: that one square only."""
+    inverse = np.linalg.inv(steps)
+
+    def light(col: Array, row: Array) -> Array:
+        s, t = transformed(inverse, col - center[0], row - center[1])
+        return np.asarray((s > 0) & (t > 0) if alone else (np.floor(s) + np.floor(t)) % 2 == 0)
+
+    return 50 + CORNER_CONTRAST * draw(light, CORNER_SIZE, CORNER_SIZE, blur_px)
+
+
+def fit_mark(window: Array, start: Array, steps: Array, alone: bool, rounding_step_dn: float = 0.0) -> Corner:
+    outside = 4  # pixels that are none of the picture
+    grey, valid = np.pad(window, outside), np.pad(np.ones(window.shape, bool), outside)
+
+    def read(col: int, row: int, side: int) -> ScanWindow:
+        part = slice(row + outside, row + outside + side), slice(col + outside, col + outside + side)
+        return ScanWindow(grey[part], (col, row), valid[part])
+
+    starts = [CornerStart(start, steps, np.array([6.0, 6.0]))]
+    return fit_corners(read, starts, quarter if alone else crossing, rounding_step_dn)[0]
+
+
+@parametrize_with_studies(("blur_px", "alone"), [(0.5, False), (0.9, False), (1.5, False), (0.8, True)], quick=(1,))
+def test_errors_are_as_large_as_their_sigmas_say(blur_px: float, alone: bool) -> None:
+    rng = np.random.default_rng(2)
+    errors = []
+    for _ in range(8):
+        center, steps = CORNER_SIZE // 2 + rng.uniform(-0.5, 0.5, 2), board_steps(rng)
+        clean = square_picture(center, steps, blur_px, alone)
+        for _ in range(6):
+            noisy = clean + rng.normal(0, NOISE, clean.shape)
+            corner = fit_mark(noisy, center + rng.normal(0, 0.3, 2), steps, alone)
+            assert not corner.reason
+            errors.append(whitened(corner.center_px - center, corner.covariance.px2))
+            assert corner.noise_dn == pytest.approx(NOISE, rel=0.35)
+    assert 0.83 < np.sqrt(np.mean(np.square(errors))) < 1.17  # 96 numbers: 7.2 % standard deviation
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.4  # 2.8 standard deviations
+
+
+@pytest.mark.parametrize(("quality", "alone"), [(5, False), (20, True)])
+def test_what_jpeg_does_to_edges_is_in_the_standard_deviations(quality: int, alone: bool) -> None:
+    """Residuals alone make them 2.5 and 2.3 times too small."""
+    rng, errors = np.random.default_rng(5), []
+    for _ in range(50):
+        center, steps = CORNER_SIZE // 2 + rng.uniform(-4, 4, 2), board_steps(rng)
+        clean = square_picture(center, steps, 0.8, alone)
+        noisy = np.rint(clean + rng.normal(0, 1.0, clean.shape)).astype(np.uint8)
+        stored = cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        grey = np.asarray(cv2.imdecode(stored, cv2.IMREAD_GRAYSCALE), float)
+        corner = fit_mark(grey, center, steps, alone, rounding_step_dn(stored.tobytes()))
+        if not corner.reason:
+            errors.append(whitened(corner.center_px - center, corner.covariance.px2))
+    assert len(errors) >= 45
+    assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.25  # 90 numbers: 7.5 % standard deviation
+
+
+@pytest.mark.parametrize("blur_px", [0.5, 1.5])
+def test_the_junction_lies_where_the_squares_meet(blur_px: float) -> None:
+    rng = np.random.default_rng(7)
+    for _ in range(8):
+        center, steps = CORNER_SIZE // 2 + rng.uniform(-0.5, 0.5, 2), board_steps(rng)
+        corner = fit_mark(square_picture(center, steps, blur_px, False), center, steps, False)
+        assert corner.junction_px is not None
+        assert np.abs(corner.junction_px - center).max() < 0.03
+
+
+def test_trap_pixel_locking() -> None:
+    """Without noise the error stays below 0.004 px wherever the corner lies in its pixel: no grid of any kind."""
+    rng = np.random.default_rng(3)
+    steps = board_steps(rng)
+    for phase in np.linspace(-0.5, 0.5, 9):
+        center = CORNER_SIZE // 2 + np.array([phase, -phase / 2])
+        corner = fit_mark(square_picture(center, steps, 0.7, False), center + 0.2, steps, False)
+        assert np.abs(corner.center_px - center).max() < 0.004
+
+
+def test_a_bent_tone_curve_and_sharpening_do_not_move_a_crossing() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(4):
+        center, steps = CORNER_SIZE // 2 + rng.uniform(-0.5, 0.5, 2), board_steps(rng)
+        linear = square_picture(center, steps, 0.8, False)
+        bent = 255 * (np.clip(linear - 45, 0, None) / 255) ** 0.45
+        corner = fit_mark(bent, center + rng.normal(0, 0.3, 2), steps, False)
+        assert np.abs(corner.center_px - center).max() < 0.01
+
+
+def test_a_stain_is_left_out() -> None:
+    rng = np.random.default_rng(5)
+    center, steps = np.array([12.1, 11.8]), np.diag([14.0, 14.0])
+    window = square_picture(center, steps, 0.8, False) + rng.normal(0, 1.0, (CORNER_SIZE, CORNER_SIZE))
+    window[7:9, 14:17] = 255
+    corner = fit_mark(window, center, steps, False)
+    assert not corner.reason
+    assert 0.02 < corner.damaged_fraction < 0.1
+    assert np.abs(corner.center_px - center).max() < 0.03
+
+
+def test_where_no_corner_is_the_reason_is_stated() -> None:
+    rng = np.random.default_rng(6)
+    start, steps = np.array([12.0, 12.0]), np.diag([14.0, 14.0])
+    assert fit_mark(rng.normal(100, 4, (CORNER_SIZE, CORNER_SIZE)), start, steps, False).reason
+    assert fit_mark(np.full((CORNER_SIZE, CORNER_SIZE), 7.0), start, steps, False).reason

@@ -9,24 +9,15 @@ import pytest
 from drawn import center, chi_square, lay_out, make_scan, paint, pixel_from_camera
 from true_marks import KIND, TrueMark, some_mark
 
-from measure import FiducialLayout, FiducialOptions, LayoutMark
+from measure import FiducialLayout, FiducialOptions, LayoutMark, MarkShape, Status, cross
+from measure.fiducials import mark_comparison
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
-from measure.fiducials.mark_comparison import (
-    SharedBlur,
-    SharedShape,
-    Touch,
-    shared_blurs,
-    shared_line_width,
-    shared_shapes,
-    touch_of_round,
-)
 from measure.fiducials.mark_fit import not_found
 from measure.fiducials.measure_frame import detect_frame, measure_frame, orient_frame
 from measure.fiducials.rows import absent_frame
 from measure.fiducials.stages import explain_misfit
-from measure.flags import Cause, Status
-from measure.marks.shapes import MarkShape, cross
+from measure.flags import Cause
 from measure.matching.gauss_newton import UNSETTLED
 from measure.results import Covariance
 from measure.tone.curve import LINEAR
@@ -41,7 +32,7 @@ def fits(seen_px: Any, sigmas: Any) -> list[Any]:
 
 
 def test_a_faint_mark_gets_the_blur_of_the_others_and_those_need_none() -> None:
-    shared = shared_blurs(fits([1.2, 1.2, 1.21, 1.19, 0.95], [0.01, 0.01, 0.02, 0.02, 0.2]))
+    shared = mark_comparison.shared_blurs(fits([1.2, 1.2, 1.21, 1.19, 0.95], [0.01, 0.01, 0.02, 0.02, 0.2]))
     assert shared[:4] == [None] * 4
     assert shared[4] is not None
     assert np.hypot(shared[4].blur_px, np.sqrt(PIXEL)) == pytest.approx(1.2, rel=0.01)
@@ -50,9 +41,9 @@ def test_a_faint_mark_gets_the_blur_of_the_others_and_those_need_none() -> None:
 
 def test_a_width_of_lines_that_most_crosses_show_is_taken_and_that_of_few_is_not() -> None:
     widths = [(-0.15, 0.02), (-0.13, 0.02), (-0.17, 0.03), (0.4, 0.05), None, None]
-    assert shared_line_width(widths) == pytest.approx(np.exp(-0.15), rel=0.03)
-    assert shared_line_width([*widths, None, None, None]) == 1.0
-    assert shared_line_width([(-0.02, 0.001)] * 4) == 1.0
+    assert mark_comparison.shared_line_width(widths) == pytest.approx(np.exp(-0.15), rel=0.03)
+    assert mark_comparison.shared_line_width([*widths, None, None, None]) == 1.0
+    assert mark_comparison.shared_line_width([(-0.02, 0.001)] * 4) == 1.0
 
 
 def test_crosses_whose_lines_are_narrower_than_drawn_are_drawn_so_and_fitted() -> None:
@@ -78,9 +69,9 @@ def test_marks_of_one_blur_are_rarely_doubted_and_another_blur_is() -> None:
     for _ in range(300):
         sigmas = rng.uniform(0.01, 0.15, 8)
         own = 1.1 * np.exp(rng.normal(0, np.hypot(sigmas, 0.05)))
-        doubted += any(each is not None and each.differs for each in shared_blurs(fits(own, sigmas)))
+        doubted += any(each is not None and each.differs for each in mark_comparison.shared_blurs(fits(own, sigmas)))
         own[0], sigmas[0] = 0.6, 0.08
-        shared = shared_blurs(fits(own, sigmas))[0]
+        shared = mark_comparison.shared_blurs(fits(own, sigmas))[0]
         found += shared is not None and shared.differs
     assert doubted <= 12  # 1 in 100, and more for how much they differ is an estimate itself
     assert found > 270
@@ -92,7 +83,7 @@ def test_how_much_blurs_differ_from_mark_to_mark_comes_out_as_it_was_drawn() -> 
     sigmas = np.array([0.03, 0.05, 0.08, 0.12, 0.2, 0.2, 0.1])
     for _ in range(400):
         own = 1.1 * np.exp(rng.normal(0, np.hypot(sigmas, between)))
-        shared = shared_blurs(fits(np.append(own, 1.1), [*sigmas, 0.3]))[-1]
+        shared = mark_comparison.shared_blurs(fits(np.append(own, 1.1), [*sigmas, 0.3]))[-1]
         assert shared is not None
         squares.append(shared.sigma**2)
     of_mean = 1 / np.sum(1 / (sigmas**2 + between**2 + 0.05**2))
@@ -102,12 +93,15 @@ def test_how_much_blurs_differ_from_mark_to_mark_comes_out_as_it_was_drawn() -> 
 
 def test_a_match_with_the_others_blur_rarely_contradicts_it_unless_its_own_is_another() -> None:
     rng, others_sigma, own_sigma = np.random.default_rng(3), 0.06, 0.1
-    result, weight = SharedBlur(np.sqrt(1.1**2 - PIXEL), others_sigma, False), others_sigma**2 / (0.06**2 + 0.1**2)
+    result, weight = (
+        mark_comparison.SharedBlur(np.sqrt(1.1**2 - PIXEL), others_sigma, False),
+        others_sigma**2 / (0.06**2 + 0.1**2),
+    )
     sigma = others_sigma * np.sqrt(1 - weight)  # of the weighted mean of both
     good = 1.1 * np.exp(weight * rng.normal(0, np.hypot(others_sigma, own_sigma), 2000))
     other = 1.1 * np.exp(weight * rng.normal(np.log(0.6), own_sigma, 2000))
     contradicted, found = (
-        sum(not result.is_confirmed(fit) for fit in fits(view, [sigma] * len(view))) for view in (good, other)
+        sum(not result.is_confirmed(fit) for fit in fits(v, [sigma] * len(v))) for v in (good, other)
     )
     assert 8 <= contradicted <= 34  # 1 in 100
     assert found > 1800
@@ -120,9 +114,9 @@ def test_marks_of_one_size_and_turn_are_rarely_doubted_and_another_is(figures: i
     for _ in range(300):
         sigmas = rng.uniform(0.005, 0.05, (5, figures))
         changes = 0.08 + rng.normal(0, np.hypot(sigmas, 0.014))  # of all alike: the drawing's fault
-        doubted += any(shape is not None and shape.differs for shape in shared_shapes(changes, sigmas))
+        doubted += any(shape is not None and shape.differs for shape in mark_comparison.shared_shapes(changes, sigmas))
         changes[0], sigmas[0] = changes[0] - 0.24 * (np.arange(figures) == 0), 0.02
-        odd = shared_shapes(changes, sigmas)[0]
+        odd = mark_comparison.shared_shapes(changes, sigmas)[0]
         found += odd is not None and odd.differs and abs(odd.off[0] + 0.24) < 0.1
     assert doubted <= 12
     assert found > 270
@@ -146,9 +140,9 @@ def test_what_touches_one_side_of_a_dot_widens_its_variance_and_chance_hardly_do
     assert np.mean([each.variance_px2 for each in chance]) < 0.05 * known_px**2
 
 
-def touch(ratio: float, sigma: float, radius_px: float, px_per_mm: float = 36.0) -> Touch:
-    shape = SharedShape(np.log([ratio]), np.array([sigma]), differs=False)
-    return touch_of_round(shape, radius_px, px_per_mm, is_damaged=False)
+def touch(ratio: float, sigma: float, radius_px: float, px_per_mm: float = 36.0) -> mark_comparison.Touch:
+    shape = mark_comparison.SharedShape(np.log([ratio]), np.array([sigma]), differs=False)
+    return mark_comparison.touch_of_round(shape, radius_px, px_per_mm, is_damaged=False)
 
 
 PX_PER_MM, SIDE_PX, AT_MM = 10.0, 600, 20.0

@@ -34,9 +34,7 @@ def test_the_variance_of_noise_is_that_before_the_fit_took_its_share() -> None:
 
 @pytest.mark.parametrize("grows", [0.0, 0.25, 0.5])
 @pytest.mark.parametrize("damaged", [0.0, 0.2])
-def test_how_noise_grows_with_light_is_known_by_residuals_and_damage_hardly_counts(
-    grows: float, damaged: float
-) -> None:
+def test_residuals_tell_how_noise_grows_with_light_and_damage_hardly_counts(grows: float, damaged: float) -> None:
     rng = np.random.default_rng(2)
     ground = np.ones((60, 60), bool)
     ground[20:32, 10:50] = False
@@ -227,7 +225,7 @@ def test_whites_cut_off_below_the_end_of_the_range_are_limits_too() -> None:
         np.testing.assert_array_equal(sides == 1, np.rint(natural) >= 250)
         start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + (0.7, -0.6)])
         fit = detect_mark(
-            scan, MarkPrediction(mark.kind.shape, start, 3.0, -1), FiducialOptions().match, mark.kind.known
+            scan, MarkPrediction(mark.kind.shape, start, 3, -1), FiducialOptions().match, mark.kind.known
         ).fit
         assert chi_square(fit, mark.place[:, 2]) < 13.8
     for sigma in np.geomspace(0.2, 20, 40):

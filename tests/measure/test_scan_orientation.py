@@ -5,20 +5,11 @@ from dataclasses import replace
 from functools import cache
 
 import cv2
+import drawn as draw
 import numpy as np
 import pytest
 from drawn import CORNERS as FRAME_CORNERS
-from drawn import (
-    PITCH_UM,
-    RING_CROSS,
-    Array,
-    found_pose,
-    frame_picture,
-    lay_out,
-    make_scan,
-    paint,
-    pixel_from_camera,
-)
+from drawn import Array
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
@@ -30,25 +21,16 @@ from measure.fiducials.options import FiducialOptions, Reads
 from measure.fiducials.scan_orientation import Drawings, MarkSite, PosedMark, side_in_camera, writing_likelihoods
 from measure.fiducials.search import FrameSearch, pitch_hypotheses
 from measure.geometry import POSES, pose_in_camera
-from measure.marks.shapes import (
-    FiducialLayout,
-    LayoutMark,
-    MarkShape,
-    MarkTemplate,
-    Side,
-    WrittenPlace,
-    polygon,
-    turned_part,
-)
+from measure.marks import shapes
 
-WILD = (WrittenPlace("left", "90"), WrittenPlace("right", "270", plate=True))
+WILD = (shapes.WrittenPlace("left", "90"), shapes.WrittenPlace("right", "270", plate=True))
 DECIDED = 7.0
 SIZE_PX = 640
 CORNERS = ((10.0, -10.0), (-10.0, -10.0), (-10.0, 10.0), (10.0, 10.0))
-LAYOUT = lay_out([MarkShape(RING_CROSS)] * 4, CORNERS, (23.0, 23.0))
+LAYOUT = draw.lay_out([shapes.MarkShape(draw.RING_CROSS)] * 4, CORNERS, (23.0, 23.0))
 
 
-def line(text: str, pose: str, side: Side, share: float = 0.2) -> Line:
+def line(text: str, pose: str, side: shapes.Side, share: float = 0.2) -> Line:
     """A line that lies in a pose in the scan, and reads to a share of its characters in the three others along it."""
     turn = int(pose.removesuffix("m")) % 180
     ways = [way for way in POSES if int(way.removesuffix("m")) % 180 == turn]
@@ -56,7 +38,7 @@ def line(text: str, pose: str, side: Side, share: float = 0.2) -> Line:
     return Line({way: Reading(text, 0.9, value) for way, value in legible.items()}, pose, ((0.0, 0.0),) * 4, side)
 
 
-Written = tuple[str, str, Side]
+Written = tuple[str, str, shapes.Side]
 
 
 def view_lines(pose: str, *camera: Written) -> list[Line]:
@@ -64,13 +46,13 @@ def view_lines(pose: str, *camera: Written) -> list[Line]:
     lines = []
     for text, own, camera_side in camera:
         scan_pose = next(each for each in POSES if pose_in_camera(each, pose) == own)
-        sides: Sequence[Side] = ("left", "right", "top", "bottom")
+        sides: Sequence[shapes.Side] = ("left", "right", "top", "bottom")
         side = next(each for each in sides if side_in_camera(each, pose) == camera_side)
         lines.append(line(text, scan_pose, side))
     return lines
 
 
-def lead(lines: Sequence[Line], pose: str, places: Sequence[WrittenPlace] = WILD) -> float:
+def lead(lines: Sequence[Line], pose: str, places: Sequence[shapes.WrittenPlace] = WILD) -> float:
     """The log-odds of a pose against the likeliest other one."""
     of_all = dict(zip(POSES, writing_likelihoods(lines, places, POSES), strict=True))
     return float(of_all[pose] - max(value for name, value in of_all.items() if name != pose))
@@ -96,8 +78,8 @@ def test_a_line_that_may_be_anybodys_does_not_decide_by_its_place() -> None:
 @pytest.mark.parametrize(
     ("written", "places"), [(("KODAK SAFETY FILM", "0", "top"), WILD), (("RUN 20 CANBERRA 7/7/89", "90", "left"), ())]
 )
-def test_the_films_own_name_and_lines_without_a_known_place_tell_the_mirror_alone(
-    written: Written, places: Sequence[WrittenPlace]
+def test_the_films_name_and_unplaced_lines_tell_the_mirror(
+    written: Written, places: Sequence[shapes.WrittenPlace]
 ) -> None:
     of_all = writing_likelihoods(view_lines("90m", written), places, POSES)
     assert of_all[4:] == pytest.approx([0.0] * 4, abs=1e-3)
@@ -114,7 +96,7 @@ def test_lines_are_read_from_the_face_that_most_reads_from() -> None:
 
 def written_frame() -> Array:
     """Pose "0": four marks alike; titles beside the left, reading upward, a plate to the right, reading downward."""
-    grey = frame_picture(LAYOUT, pixel_from_camera("0", 0.004, ((SIZE_PX - 1) / 2,) * 2), size=SIZE_PX)
+    grey = draw.frame_picture(LAYOUT, draw.pixel_from_camera("0", 0.004, ((SIZE_PX - 1) / 2,) * 2), size=SIZE_PX)
     border = np.ones(grey.shape, dtype=bool)
     border[90:-90, 90:-90] = False
     grey[border] = 3000 + np.random.default_rng(7).normal(0, 200, int(border.sum()))
@@ -126,16 +108,13 @@ def written_frame() -> Array:
 
 
 def measure_picture(
-    pose: str,
-    places: tuple[WrittenPlace, ...],
-    reads: Reads = "pose",
-    known_lines: tuple[KnownLine, ...] = (),
+    pose: str, places: tuple[shapes.WrittenPlace, ...], reads: Reads = "pose", known_lines: tuple[KnownLine, ...] = ()
 ) -> FrameMeasurement:
     grey = written_frame()
     grey = np.rot90(grey[:, ::-1] if pose.endswith("m") else grey, int(pose.rstrip("m")) // 90)
-    scan = make_scan(np.ascontiguousarray(grey))
+    scan = draw.make_scan(np.ascontiguousarray(grey))
     options = FiducialOptions(writing=reads, known_lines=known_lines)
-    return measure_fiducials(scan, replace(LAYOUT, writing=places), (PITCH_UM, PITCH_UM), options)
+    return measure_fiducials(scan, replace(LAYOUT, writing=places), (draw.PITCH_UM, draw.PITCH_UM), options)
 
 
 @parametrize_with_studies("pose", ["270", "90m"])
@@ -160,7 +139,7 @@ def test_where_no_place_is_known_frames_are_named_so_that_their_writing_is_uprig
 def test_nothing_is_read_where_nobody_asks_and_a_mirror_is_not_assumed() -> None:
     silent = measure_picture("90m", WILD, "none")
     assert silent.writing is None
-    assert found_pose(silent) == ("0", False)
+    assert draw.found_pose(silent) == ("0", False)
 
 
 TITLE = KnownLine("RUN 31  CANBERRA  17.6.69", "90", "left", ((-13.9, -9.0), (-13.9, 2.0), (-13.1, 2.0), (-13.1, -9.0)))
@@ -169,7 +148,7 @@ TITLE = KnownLine("RUN 31  CANBERRA  17.6.69", "90", "left", ((-13.9, -9.0), (-1
 def test_a_frame_that_lies_as_others_of_its_roll_is_read_only_where_their_line_stands() -> None:
     alike = measure_picture("0", WILD, known_lines=(TITLE,))
     assert [(each.side, each.pose) for each in alike.writing or ()] == [("left", "90")]
-    assert found_pose(alike) == ("0", True)
+    assert draw.found_pose(alike) == ("0", True)
 
 
 @pytest.mark.study
@@ -178,7 +157,7 @@ def test_a_frame_that_lies_otherwise_is_read_as_a_whole(pose: str) -> None:
     """The plate lies where the title is looked for, or the title itself in a mirror."""
     other = measure_picture(pose, WILD, known_lines=(TITLE,))
     assert {each.side for each in other.writing or ()} == {"left", "right"}
-    assert found_pose(other) == (pose, True)
+    assert draw.found_pose(other) == (pose, True)
 
 
 def test_a_known_line_is_one_that_says_the_same_and_lies_so_plainly() -> None:
@@ -198,7 +177,7 @@ BLOCK[:, :24], BLOCK[18:43, :36], BLOCK[28:40, :45] = 1, 1, 1  # of the border, 
 def test_a_block_among_landscape_shows_which_way_it_is_turned() -> None:
     """A block steady in its chip, in landscapes as rough as it is deep, in each of its four directions; also where the
     place is another mark's, which slid along an edge that both have."""
-    template = MarkTemplate(
+    template = shapes.MarkTemplate(
         np.where(BLOCK > 0, 20.0, 150.0),
         1000.0,
         (30, 30),
@@ -215,35 +194,37 @@ def test_a_block_among_landscape_shows_which_way_it_is_turned() -> None:
                 assert np.sort(result)[-2] < -4.0
 
 
-def among_landscape(template: MarkTemplate, linear: NDArray[np.float64], seed: int, slid_px: float) -> MarkSite:
+def among_landscape(template: shapes.MarkTemplate, linear: NDArray[np.float64], seed: int, slid_px: float) -> MarkSite:
     rng = np.random.default_rng(seed)
     landscape = cv2.GaussianBlur(rng.normal(0.0, 1.0, (3 * SIDE, 3 * SIDE)), (0, 0), 4.0)
     grey = 150.0 + 45.0 * landscape / landscape.std()
     shown = BLOCK[:: int(-linear[1, 1]), :: int(linear[0, 0])] > 0
     grey[SIDE : 2 * SIDE, SIDE : 2 * SIDE][shown] = 20.0
     grey = np.clip(np.rint(grey + rng.normal(0.0, 1.5, grey.shape)), 0, 255)
-    scan = make_scan(grey, 255)
+    scan = draw.make_scan(grey, 255)
     place = np.column_stack([linear, [SIDE + 30.0, SIDE + 30.0]])
     fit = match(ScanWindow(grey), template, place, MatchOptions(freedom="shift", estimate_blur=False))
     return MarkSite(scan, fit, fit.center_px + slid_px, None, Drawings([template], FLIP, 0.0), 5.0)
 
 
-HALF_WEDGE = MarkShape(polygon(((0.0, 0.0), (1.4, 0.0), (1.4, 0.8))))
+HALF_WEDGE = shapes.MarkShape(shapes.polygon(((0.0, 0.0), (1.4, 0.0), (1.4, 0.8))))
 ANGLES = [float(np.degrees(np.arctan2(y, x))) for x, y in FRAME_CORNERS]
-LEANING = lay_out([MarkShape(tuple(turned_part(part, angle) for part in HALF_WEDGE.parts)) for angle in ANGLES])
-PITCH = (PITCH_UM, PITCH_UM)
+LEANING = draw.lay_out(
+    [shapes.MarkShape(tuple(shapes.turned_part(part, angle) for part in HALF_WEDGE.parts)) for angle in ANGLES]
+)
+PITCH = (draw.PITCH_UM, draw.PITCH_UM)
 OPTIONS = FiducialOptions()
 # Blocks that reach into the frame at the middles of its sides, whose coordinates tell the poses apart.
-POSE_LEFT_OPEN_BLOCK = MarkShape(polygon(((0.0, 0.0), (6.0, 0.0), (6.0, -3.0), (1.2, -3.0))))
+POSE_LEFT_OPEN_BLOCK = shapes.MarkShape(shapes.polygon(((0.0, 0.0), (6.0, 0.0), (6.0, -3.0), (1.2, -3.0))))
 FRAME_MM, PX_PER_MM = 30.0, 10.0
 UNEVEN = ((11.3, 0.0), (0.0, 11.2), (-11.0, 0.2), (0.1, -11.0))
-BLOCKS = FiducialLayout(
+BLOCKS = shapes.FiducialLayout(
     tuple(
-        LayoutMark(
+        shapes.LayoutMark(
             str(k),
             place,
             (0.02, 0.02),
-            MarkShape(tuple(turned_part(part, 90.0 * k) for part in POSE_LEFT_OPEN_BLOCK.parts)),
+            shapes.MarkShape(tuple(shapes.turned_part(part, 90.0 * k) for part in POSE_LEFT_OPEN_BLOCK.parts)),
         )
         for k, place in enumerate(UNEVEN)
     ),
@@ -252,7 +233,7 @@ BLOCKS = FiducialLayout(
 
 
 def test_a_frame_viewed_as_its_mirror_image_is_renamed_as_it_lies() -> None:
-    scan = make_scan(frame_picture(LEANING, pixel_from_camera("0")))
+    scan = draw.make_scan(draw.frame_picture(LEANING, draw.pixel_from_camera("0")))
     hypotheses = pitch_hypotheses(scan, LEANING, PITCH, OPTIONS)[0]
     found = FrameSearch(scan, LEANING, OPTIONS).search_scan(OPTIONS, hypotheses)
     right = next(each for each in found.placements if each.pose == "0")
@@ -265,7 +246,7 @@ def test_a_frame_viewed_as_its_mirror_image_is_renamed_as_it_lies() -> None:
     assert rename_frame(scan, frame, "0m") is frame
 
 
-def right_mm(layout: FiducialLayout) -> Array:
+def right_mm(layout: shapes.FiducialLayout) -> Array:
     return np.array([mark.xy_mm for mark in layout.marks])
 
 
@@ -273,13 +254,13 @@ def right_mm(layout: FiducialLayout) -> Array:
 def block_picture(pose: str) -> tuple[Array, Array]:
     """Shadows in a frame on a rough dark border, and pixel_from_camera (2, 3)."""
     rng, size = np.random.default_rng(3), 380
-    matrix = pixel_from_camera(pose, center=(190.6, 188.3))
+    matrix = draw.pixel_from_camera(pose, center=(190.6, 188.3))
     matrix[:, :2] *= PX_PER_MM / 20.0
     cols_rows = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1)
     xy = (cols_rows - matrix[:, 2]) @ np.linalg.inv(matrix[:, :2]).T
     exposed = (np.abs(xy) < FRAME_MM / 2).all(axis=-1).astype(float)
     for mark in BLOCKS.marks:
-        paint(exposed, mark.mark, mark.xy_mm, matrix, -1.0, half=75, blur_px=0.01)
+        draw.paint(exposed, mark.mark, mark.xy_mm, matrix, -1.0, half=75, blur_px=0.01)
     ground = 30000 + 2000 * gaussian_filter(rng.normal(0, 1, (size, size)), 4.0) * 14
     border = 6000 + 1500 * rng.normal(0, 1, (size, size))
     light = gaussian_filter(exposed.clip(0.0, 1.0), 0.8)
@@ -292,7 +273,7 @@ def block_picture(pose: str) -> tuple[Array, Array]:
 def test_blocks_at_the_border_are_measured_alike_with_their_pose_open_and_set(pose: str, requested: str) -> None:
     grey, matrix = block_picture(pose)
     truth = right_mm(BLOCKS) @ matrix[:, :2].T + matrix[:, 2]
-    frame = measure_fiducials(make_scan(grey), BLOCKS, (1000 / PX_PER_MM,) * 2, replace(OPTIONS, pose=requested))
+    frame = measure_fiducials(draw.make_scan(grey), BLOCKS, (1000 / PX_PER_MM,) * 2, replace(OPTIONS, pose=requested))
     assert frame.pose is not None
     assert frame.pose.name == pose
     assert not frame.problems

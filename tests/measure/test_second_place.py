@@ -13,32 +13,20 @@ from measure import FiducialOptions, MatchOptions, ScanWindow, match, measure_fi
 from measure.detection.localisation import MarkPrediction
 from measure.fiducials.mark_fit import detect_mark
 from measure.flags import Cause
-from measure.marks.shapes import (
-    Bar,
-    Disk,
-    FiducialLayout,
-    LayoutMark,
-    Mark,
-    MarkShape,
-    MarkTemplate,
-    cross,
-    polygon,
-    ring_cross,
-    turned,
-)
+from measure.marks import shapes
 from measure.matching.covariance import LinearFit, across_edges
 from measure.noise.noise_model import NoiseModel, combined, products
 from measure.results import MarkFit, SecondPlace
 from measure.targets.disks import UNIT_DISK, fit_disk
 
 SIZE, CONTRAST = 41, 500.0
-RING_CROSS = MarkShape(ring_cross(1.0, 0.2, 1.6, 0.15))
+RING_CROSS = shapes.MarkShape(shapes.ring_cross(1.0, 0.2, 1.6, 0.15))
 OPTIONS = MatchOptions(linear_sigma=0.05)
 DISK_SIZE, RADIUS = 31, 3.0
 DISK_PLACE = np.array([15.2, 14.7])
 
 
-def edge_chances(mark: Mark, grey: Array, place: Array, options: MatchOptions, count: int) -> Array:
+def edge_chances(mark: shapes.Mark, grey: Array, place: Array, options: MatchOptions, count: int) -> Array:
     """The probabilities of the differences of the places by edges in so many noisy pictures."""
     rng = np.random.default_rng(7)
     noisy = [1000 + CONTRAST * grey + rng.normal(0, 20.0, grey.shape) for _ in range(count)]
@@ -90,7 +78,7 @@ def test_where_paint_slopes_its_place_is_nearer_than_the_matched_one() -> None:
     assert fit.sloping.chance < 1e-6
 
 
-CROSS = MarkShape(cross(1.5, 0.15))
+CROSS = shapes.MarkShape(shapes.cross(1.5, 0.15))
 FOLD, SPARE_PX = 4, 6
 SHIFTS = ((2, 0), (0, 2), (1, 1), (3, 2), (2, 3))
 
@@ -116,7 +104,7 @@ def test_the_sums_are_of_second_derivatives_across_the_edges() -> None:
         np.testing.assert_allclose((weights * picture).sum(axis=(1, 2)), expected, rtol=0.01, atol=0.02)
 
 
-def ragged(axis: int, rng: np.random.Generator) -> list[Bar]:
+def ragged(axis: int, rng: np.random.Generator) -> list[shapes.Bar]:
     """The pieces of a line of 3 mm along an axis."""
     ends, off_mm = np.linspace(-1.5, 1.5, 31).tolist(), rng.normal(0, 0.008, 30).tolist()
 
@@ -124,7 +112,7 @@ def ragged(axis: int, rng: np.random.Generator) -> list[Bar]:
         return (off, along) if axis else (along, off)
 
     pieces = zip(ends[:-1], ends[1:], off_mm, strict=True)
-    return [Bar(place(begin, off), place(end, off), 0.15) for begin, end, off in pieces]
+    return [shapes.Bar(place(begin, off), place(end, off), 0.15) for begin, end, off in pieces]
 
 
 def test_ragged_lines_are_known_as_badly_as_they_are() -> None:
@@ -132,7 +120,7 @@ def test_ragged_lines_are_known_as_badly_as_they_are() -> None:
     a cross be known three times as well as it is."""
     rng, errors, known, by_noise = np.random.default_rng(4), [], [], []
     for _ in range(8):
-        mark = some_mark(Kind("ragged", MarkShape((*ragged(0, rng), *ragged(1, rng)))), 1.0, rng)
+        mark = some_mark(Kind("ragged", shapes.MarkShape((*ragged(0, rng), *ragged(1, rng)))), 1.0, rng)
         grey = 1000 * mark.picture + rng.normal(0, 10, (mark.size, mark.size))
         fit = match(ScanWindow(grey), CROSS, mark.place, MatchOptions())
         errors.append(fit.center_px - mark.place[:, 2])
@@ -145,7 +133,7 @@ def test_ragged_lines_are_known_as_badly_as_they_are() -> None:
 def test_a_mark_in_a_textured_border_is_known_as_badly_as_it_is() -> None:
     """Its blotches are cut out as damage, and bend its edges all the same; outside of it there is hardly any noise."""
     rng, errors, known, without = np.random.default_rng(6), [], [], []
-    block = MarkShape(polygon(((0.0, 0.0), (1.2, 1.2), (3.0, 1.2), (3.0, -1.2), (1.2, -1.2))))
+    block = shapes.MarkShape(shapes.polygon(((0.0, 0.0), (1.2, 1.2), (3.0, 1.2), (3.0, -1.2), (1.2, -1.2))))
     for _ in range(8):
         mark = some_mark(Kind("block", block), 0.8, rng)
         texture = gaussian_filter(rng.normal(size=(mark.size, mark.size)), 2.0)
@@ -179,12 +167,12 @@ def test_a_chip_sampled_too_coarsely_is_found_in_pictures_shifted_by_known_parts
         fine = some_mark(KIND[name], 0.8, rng, 200, 32.0).picture
         chip = coarse(fine, 0, 0)[SPARE_PX:-SPARE_PX, SPARE_PX:-SPARE_PX]
         middle = (np.array(chip.shape) - 1) / 2
-        template = MarkTemplate(chip, 1000.0, (float(middle[0]), float(middle[1])))
+        drawn = shapes.MarkTemplate(chip, 1000.0, (float(middle[0]), float(middle[1])))
         for shift in SHIFTS:
             true = middle + SPARE_PX - np.array(shift) / FOLD
             start = np.column_stack([np.diag([1.0, -1.0]), np.rint(true)])
             fit = match(
-                ScanWindow(100 * coarse(fine, *shift)), template, start, MatchOptions("shift", estimate_blur=False)
+                ScanWindow(100 * coarse(fine, *shift)), drawn, start, MatchOptions("shift", estimate_blur=False)
             )
             assert fit.converged
             errors.append(fit.center_px - true)
@@ -208,7 +196,7 @@ def sighted(mark: TrueMark, grey: np.ndarray, rng: np.random.Generator, rounding
 def test_marks_say_how_well_the_frame_s_stretch_and_shear_are_known_that_move_them() -> None:
     """A few marks close together, say, that are given a little off: all their tips are then off alike."""
     rng, roughly = np.random.default_rng(8), 2e-3
-    dots = MarkShape((*cross(0.5, 0.15), *(Disk((1.6, y), 0.18) for y in (-0.5, 0.0, 0.5))))
+    dots = shapes.MarkShape((*shapes.cross(0.5, 0.15), *(shapes.Disk((1.6, y), 0.18) for y in (-0.5, 0.0, 0.5))))
     errors, covariances, best, bounds = [], [], [], []
     for kind in (KIND["wedge"], KIND["wing"], Kind("identification dots", dots, ALL_MOVES)):
         true = some_mark(replace(kind, known=roughly), 1.0, rng)
@@ -243,7 +231,9 @@ def test_wings_take_rotation_and_scale_from_their_frame() -> None:
     rng = np.random.default_rng(3)
     places = [(-25.0, 0.0, 90.0), (25.0, 0.0, -90.0), (0.0, 25.0, 0.0), (3.0, -25.0, 180.0)]
     marks = tuple(
-        LayoutMark(str(number), (x, y), (0.01, 0.01), turned(MarkShape(polygon(TRUE_WING)), turn))
+        shapes.LayoutMark(
+            str(number), (x, y), (0.01, 0.01), shapes.turned(shapes.MarkShape(shapes.polygon(TRUE_WING)), turn)
+        )
         for number, (x, y, turn) in enumerate(places)
     )
     c, s = np.cos(0.026), np.sin(0.026)
@@ -252,12 +242,14 @@ def test_wings_take_rotation_and_scale_from_their_frame() -> None:
     for mark in marks:
         center = np.array([320.3, 319.8]) + linear @ mark.xy_mm
         corner = np.floor(center).astype(int) - 40
-        kind = Kind("wing", MarkShape(mark.mark.parts) if isinstance(mark.mark, MarkShape) else KIND["wing"].shape)
+        kind = Kind(
+            "wing", shapes.MarkShape(mark.mark.parts) if isinstance(mark.mark, shapes.MarkShape) else KIND["wing"].shape
+        )
         shown = TrueMark(kind, np.column_stack([linear, center - corner]), 81, 1.0).picture
         grey[corner[1] : corner[1] + 81, corner[0] : corner[0] + 81] += PRECISION_CONTRAST * shown
         true.append(center)
     grey += 150 * rng.standard_normal(grey.shape)
-    result = measure_fiducials(make_scan(grey), FiducialLayout(marks, (60.0, 60.0)), (100.7, 100.7))
+    result = measure_fiducials(make_scan(grey), shapes.FiducialLayout(marks, (60.0, 60.0)), (100.7, 100.7))
     errors = [np.asarray(mark.center_px) - place for mark, place in zip(result.marks, true, strict=True)]
     assert np.sqrt(np.mean(np.square(errors))) < 0.009  # of a placement's rotation alone: 0.012 and more
 
@@ -276,7 +268,7 @@ def test_what_compression_hides_of_a_faint_mark_is_added_to_its_sigma() -> None:
 
 def test_lines_far_wider_than_the_mark_s_are_not_the_mark() -> None:
     """Handwriting, say: drawn as finely as the mark it would need more contrast than a scan has."""
-    wide, fine = (MarkShape(cross(1.5, line_mm)) for line_mm in (0.5, 0.03))
+    wide, fine = (shapes.MarkShape(shapes.cross(1.5, line_mm)) for line_mm in (0.5, 0.03))
     mark = TrueMark(Kind("wide cross", wide), np.array([[10.0, 0.0, 40.3], [0.0, -10.0, 39.8]]), 81, 3.0)
     grey = 30 + 200 * mark.picture + np.random.default_rng(1).normal(0, 3, mark.picture.shape)
     detection = detect_mark(make_scan(grey, 255), MarkPrediction(fine, mark.place, 3.0, 1), FiducialOptions().match)

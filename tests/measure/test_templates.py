@@ -178,10 +178,8 @@ def test_marks_that_are_each_turned_with_their_place_keep_what_nothing_tells() -
     templates, moves = share_origins([clicked(*each, rng) for each in zip(shapes, off, strict=True)], PLACES, POSES)
     assert templates[0].alike == ("90", "180", "270")
     left = off + moves  # of the origins from the tips: alike once each is turned back
-    turned_back = np.array([turn.T @ each for turn, each in zip(quarters, left, strict=True)])
-    np.testing.assert_allclose(
-        turned_back, np.broadcast_to(turned_back.mean(axis=0), (4, 2)), atol=0.15 / SYMMETRY_PX_PER_MM
-    )
+    turned = np.array([turn.T @ each for turn, each in zip(quarters, left, strict=True)])
+    np.testing.assert_allclose(turned, turned.mean(axis=0) + np.zeros((4, 2)), atol=0.15 / SYMMETRY_PX_PER_MM)
 
 
 @pytest.mark.parametrize("places", [PLACES, PLACES * (1.0, 0.5)])
@@ -197,15 +195,13 @@ def test_marks_that_differ_stay_as_they_were(places: np.ndarray) -> None:
 GIVEN = MarkShape(cross(0.8, 0.1))
 SHORT = MarkShape((Bar((-0.7, 0.0), (0.7, 0.0), 0.1), Bar((0.0, -0.8), (0.0, 0.7), 0.1)))
 COVERED = MarkShape((Bar((-0.8, 0.0), (0.8, 0.0), 0.1), Bar((0.0, -0.8), (0.0, 0.5), 0.1)))
-OWN_FIGURES_PLACES = tuple((7.0 * x, 7.0 * y) for y in (1, 0, -1) for x in (-1, 0, 1))
-LAYOUT, PITCH = lay_out([GIVEN] * 9, OWN_FIGURES_PLACES), (50.0, 50.0)
+OWN_PLACES = tuple((7.0 * x, 7.0 * y) for y in (1, 0, -1) for x in (-1, 0, 1))
+LAYOUT, PITCH = lay_out([GIVEN] * 9, OWN_PLACES), (50.0, 50.0)
 
 
 def plate_frame(number: int, covered: bool = False) -> FrameMeasurement:
     """A frame of a plate whose third cross has three short arms; an arm of the sixth one may be covered."""
-    plate = lay_out(
-        [SHORT if k == 2 else COVERED if k == 5 and covered else GIVEN for k in range(9)], OWN_FIGURES_PLACES
-    )
+    plate = lay_out([SHORT if k == 2 else COVERED if k == 5 and covered else GIVEN for k in range(9)], OWN_PLACES)
     matrix = pixel_from_camera("0", 0.008 + 0.001 * number, (202.3 + 0.3 * number, 197.6 - 0.4 * number))
     return replace(measure_grey(frame_picture(plate, matrix, seed=number), LAYOUT), image=str(number))
 
@@ -283,7 +279,5 @@ def make_frames(figures: Sequence[Mapping[str, float]], doubt: Reason) -> list[F
          unlike_others(0.9, None), Status.MEASURED),
     ],
 )  # fmt: skip
-def test_a_doubt_is_dropped_where_the_plate_explains_it(
-    figures: Sequence[Mapping[str, float]], doubt: Reason, status: Status
-) -> None:
+def test_a_plate_explains_a_doubt_away(figures: Sequence[Mapping[str, float]], doubt: Reason, status: Status) -> None:
     assert check_own_figures(make_frames(figures, doubt))[0].marks[0].status is status

@@ -1,23 +1,35 @@
 """Tone curves: what is believed of them, what pictures say of them, and marks measured through them."""
 
+import struct
+import zlib
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
+import imagecodecs
 import numpy as np
 import pytest
-from drawn import ALIKE, frame_picture, make_scan, pixel_from_camera
+import tifffile
+from drawn import ALIKE, brute_picture, chi_square, frame_picture, make_scan, pixel_from_camera, placed
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 from true_marks import KIND, Kind, TrueMark, some_mark, whitened_rms
 
-from measure import FiducialOptions, MarkFit, MarkShape, MatchOptions, match, polygon
+import measure
+from measure import FiducialLayout, LayoutMark, Status, read_window
 from measure.detection.localisation import MarkPrediction
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.mark_fit import Detection, detect_mark, options_for
 from measure.fiducials.measure_frame import measure_frame, shift_to_curve
-from measure.marks.shapes import FiducialLayout, LayoutMark
-from measure.matching.window import read_window
+from measure.flags import Cause
+from measure.scans.jpeg import covariance_of_compression, rounding_step_dn
+from measure.scans.opening import declared_tone
 from measure.tone.curve import LINEAR, Tone, ToneInformation, power, sampled_curve, srgb
+from measure.tone.declared import curve_of_profile
 from measure.tone.estimate import FrameTone, MarkTone, tone_score
+from measure.tone.sharpening import Sharpening
 from synthetic_images.tone_curve import coded
 
 FULL = 65535.0
@@ -26,7 +38,10 @@ SETTLED = 1e-5  # the square of how far a curve may still move, in its prior sta
 CURVES: tuple[float | str, ...] = (1.0, 2.2, "srgb", "s-curve")
 # A half-wedge that grows out of the border: its tip, and no more, holds it along its axis.
 TIP = Kind(
-    "tip", MarkShape(polygon(((0.0, 0.0), (-2.6, 6.0), (2.6, 6.0))), known_mm=((-3.0, -2.0), (3.0, 1.8))), (), 1e-4
+    "tip",
+    measure.MarkShape(measure.polygon(((0.0, 0.0), (-2.6, 6.0), (2.6, 6.0))), known_mm=((-3.0, -2.0), (3.0, 1.8))),
+    (),
+    1e-4,
 )
 
 
@@ -35,13 +50,13 @@ def encode_mark(mark: TrueMark, curve: float | str, snr: float, rng: np.random.G
     return FULL * coded(np.clip(light, 0.0, 1.0).astype(np.float32), curve)
 
 
-def fit_mark(mark: TrueMark, code: np.ndarray, tone: Tone) -> MarkFit:
+def fit_mark(mark: TrueMark, code: np.ndarray, tone: Tone) -> measure.MarkFit:
     scan = make_scan(code).replace_tone(tone)
-    options = options_for(mark.kind.shape, MatchOptions(linear_sigma=0.05), mark.kind.known)
-    return match(read_window(scan, (0, 0, mark.size, mark.size)), mark.kind.shape, mark.place, options)
+    options = options_for(mark.kind.shape, measure.MatchOptions(linear_sigma=0.05), mark.kind.known)
+    return measure.match(read_window(scan, (0, 0, mark.size, mark.size)), mark.kind.shape, mark.place, options)
 
 
-def settled(marks: list[TrueMark], codes: list[np.ndarray], prior: Tone) -> tuple[list[MarkFit], FrameTone]:
+def settled(marks: list[TrueMark], codes: list[np.ndarray], prior: Tone) -> tuple[list[measure.MarkFit], FrameTone]:
     """From the first start at which the marks agree on the curve that they were matched by, or the best."""
     tried = []
     for start in (prior, prior.shift_to_power(1.0), prior.shift_to_power(2.2)):
@@ -53,7 +68,7 @@ def settled(marks: list[TrueMark], codes: list[np.ndarray], prior: Tone) -> tupl
 
 def settled_from(
     tone: Tone, marks: list[TrueMark], codes: list[np.ndarray], prior: Tone
-) -> tuple[list[MarkFit], FrameTone]:
+) -> tuple[list[measure.MarkFit], FrameTone]:
     for _ in range(5):
         fits = [fit_mark(mark, code, tone) for mark, code in zip(marks, codes, strict=True)]
         estimate = {n: fit.tone for n, fit in enumerate(fits) if fit.tone is not None}
@@ -127,9 +142,9 @@ def test_a_refit_weighs_noise_that_grows_with_light_as_a_fit_from_scratch_does()
     code = FULL * coded((DARK + (LIGHT - DARK) * mark.picture).astype(np.float32), 2.2)
     scan = make_scan(code + rng.normal(0, 1500, code.shape)).replace_tone(tone)
     window = read_window(scan, (0, 0, mark.size, mark.size))
-    options = options_for(mark.kind.shape, MatchOptions(linear_sigma=0.05), mark.kind.known)
-    fit = match(window, mark.kind.shape, mark.place, options)
-    again = match(window, mark.kind.shape, mark.place, options, before=fit)
+    options = options_for(mark.kind.shape, measure.MatchOptions(linear_sigma=0.05), mark.kind.known)
+    fit = measure.match(window, mark.kind.shape, mark.place, options)
+    again = measure.match(window, mark.kind.shape, mark.place, options, before=fit)
     assert again.covariance_px2 == pytest.approx(fit.covariance_px2, rel=0.05, abs=2e-5)
     assert np.hypot(*(again.center_px - fit.center_px)) < 0.002
 
@@ -154,7 +169,7 @@ def test_many_scans_in_jpeg_tell_the_curve_no_better_than_rounding_lets_them() -
     for step_dn in (0.0, 12.0):
         scan = make_scan(code, 255, step_dn).replace_tone(Tone.unknown())
         expected = MarkPrediction(mark.kind.shape, mark.place, 3.0, 1)
-        fit = detect_mark(scan, expected, MatchOptions(linear_sigma=0.05), mark.kind.known).fit
+        fit = detect_mark(scan, expected, measure.MatchOptions(linear_sigma=0.05), mark.kind.known).fit
         assert fit is not None
         assert fit.tone is not None
         estimate = [ToneInformation.pooled([fit.tone.information] * count).scanner_information for count in (1, 16)]
@@ -239,7 +254,7 @@ def test_a_curve_far_from_the_first_one_is_reached_from_another_start() -> None:
     light = (6000.0 + 40000.0 * (frame_picture(ALIKE, matrix) - 7382.0) / 7500.0) / FULL
     scan = make_scan(FULL * np.clip(light, 0.0, 1.0) ** 1.5).replace_tone(Tone.unknown())
     placement = Placement("0", matrix, 4.0, 4, 1, 1, (0.05, 0.05))
-    frame = measure_frame(scan, ALIKE, placement, FiducialOptions(pose="0"))
+    frame = measure_frame(scan, ALIKE, placement, measure.FiducialOptions(pose="0"))
     power, sigma = frame.tone.tone.equivalent_power(frame.tone.least, frame.tone.greatest)
     assert abs(power - 1 / 1.5) < 3 * sigma < 0.2
     for fit, given in zip(frame.inlier_fits.values(), ALIKE.marks, strict=True):
@@ -253,10 +268,289 @@ def test_the_last_step_of_the_curve_moves_a_mark_as_another_fit_does() -> None:
     fit, expected = (fit_mark(mark, code, tone) for tone in (before, after))
     scan, placement = make_scan(code).replace_tone(before), Placement("0", mark.place, 1.0, 1, 1, 1, (0.1, 0.1))
     layout = FiducialLayout((LayoutMark("1", (0.0, 0.0), (0.01, 0.01), TIP.shape),), (1.0, 1.0))
-    frame = Frame.from_placement(scan, layout, placement, FiducialOptions("0"))
+    frame = Frame.from_placement(scan, layout, placement, measure.FiducialOptions("0"))
     frame = replace(frame, detections=(Detection(fit.center_px, True, fit),), tone=FrameTone(after))
     (shifted,) = shift_to_curve(frame).detections
     refitted = expected.center_px - fit.center_px
     assert shifted.fit is not None
     assert np.hypot(*refitted) > 0.2
     np.testing.assert_allclose(shifted.fit.center_px - fit.center_px, refitted, atol=0.02)
+
+
+GREY = np.linspace(0, 255, 256).astype(np.uint8).reshape(16, 16)
+HALF = 0.5  # of full scale
+
+
+def light(tone: Tone | None, code: float = HALF) -> float:
+    assert tone is not None
+    return float(tone.light(np.array([code]), 1.0)[0])
+
+
+def profile(curve: bytes) -> bytes:
+    """An ICC profile of one tag, the curve of grey."""
+    return bytes(128) + struct.pack(">I4sII", 1, b"kTRC", 144, len(curve)) + curve
+
+
+GAMMA = b"curv" + bytes(4) + struct.pack(">IH", 1, round(1.8 * 256))
+TABLE = b"curv" + bytes(4) + struct.pack(">I", 256) + (np.arange(256) ** 2).astype(">u2").tobytes()
+SRGB = b"para" + bytes(4) + struct.pack(">HH", 3, 0) + struct.pack(
+    ">5i", *(round(v * 65536) for v in (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045))
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("curve", "expected"), [(GAMMA, HALF**1.8), (TABLE, HALF**2), (SRGB, 0.21404), (b"curv" + bytes(8), HALF)]
+)
+def test_profiles_of_every_kind_of_curve(curve: bytes, expected: float, tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, GREY, iccprofile=profile(curve))
+    tone = declared_tone(path)
+    assert light(tone) == pytest.approx(expected, abs=0.003)
+    assert tone is not None
+    assert tone.is_declared
+    assert "ICC" in tone.source
+
+
+def test_a_profile_of_another_program_agrees_with_its_own_curve(tmp_path: Path) -> None:
+    made = imagecodecs.cms_profile("gray", gamma=2.2)
+    curve = curve_of_profile(made)
+    assert curve is not None
+    assert np.interp(HALF, np.linspace(0, 1, len(curve)), curve) == pytest.approx(HALF**2.2, abs=0.003)
+    tifffile.imwrite(tmp_path / "a.tif", GREY, iccprofile=made)
+    assert light(declared_tone(tmp_path / "a.tif")) == pytest.approx(HALF**2.2, abs=0.003)
+
+
+def test_a_transfer_function(tmp_path: Path) -> None:
+    values = tuple(int(v) for v in 65535 * np.linspace(0, 1, 256) ** 1.5)
+    tifffile.imwrite(tmp_path / "a.tif", GREY, photometric="minisblack", extratags=[(301, 3, 256, values, True)])
+    assert light(declared_tone(tmp_path / "a.tif")) == pytest.approx(HALF**1.5, abs=0.003)
+
+
+def chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+@pytest.mark.parametrize(
+    ("chunks", "expected"),
+    [
+        (chunk(b"gAMA", struct.pack(">I", 45455)), HALF**2.2),
+        (chunk(b"sRGB", b"\0") + chunk(b"gAMA", struct.pack(">I", 100000)), 0.21404),
+        (chunk(b"iCCP", b"grey\0\0" + zlib.compress(profile(GAMMA))) + chunk(b"sRGB", b"\0"), HALF**1.8),
+    ],
+)
+def test_chunks_of_png_files_in_their_order_of_precedence(chunks: bytes, expected: float, tmp_path: Path) -> None:
+    data = cv2.imencode(".png", GREY)[1].tobytes()
+    (tmp_path / "a.png").write_bytes(data[:33] + chunks + data[33:])
+    assert light(declared_tone(tmp_path / "a.png")) == pytest.approx(expected, abs=0.003)
+
+
+def test_jpeg_files_with_a_profile_and_with_exif(tmp_path: Path) -> None:
+    data = cv2.imencode(".jpg", GREY)[1].tobytes()
+    whole = profile(TABLE)
+    pieces = [whole[:300], whole[300:]]
+    segments = b"".join(
+        b"\xff\xe2" + struct.pack(">H", 16 + len(piece)) + b"ICC_PROFILE\0" + bytes((number, 2)) + piece
+        for number, piece in reversed(list(enumerate(pieces, 1)))
+    )
+    (tmp_path / "a.jpg").write_bytes(data[:2] + segments + data[2:])
+    assert light(declared_tone(tmp_path / "a.jpg")) == pytest.approx(HALF**2, abs=0.003)
+    # One directory with a pointer to Exif's own, which has ColorSpace = 1.
+    exif = b"MM\0*" + struct.pack(">I", 8)
+    exif += struct.pack(">HHHII", 1, 34665, 4, 1, 26) + struct.pack(">I", 0)
+    exif += struct.pack(">HHHIHH", 1, 0xA001, 3, 1, 1, 0) + struct.pack(">I", 0)
+    body = b"Exif\0\0" + exif
+    (tmp_path / "b.jpg").write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", 2 + len(body)) + body + data[2:])
+    assert light(declared_tone(tmp_path / "b.jpg")) == pytest.approx(0.21404, abs=0.003)
+
+
+def test_a_file_that_says_nothing_or_nonsense_says_no_curve(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", GREY)
+    assert declared_tone(tmp_path / "a.tif") is None
+    falling = b"curv" + bytes(4) + struct.pack(">I", 3) + np.array([9, 5, 1]).astype(">u2").tobytes()
+    for number, broken in enumerate((b"short", profile(falling), profile(b"curv" + bytes(3)), bytes(200))):
+        path = tmp_path / f"{number}.tif"
+        tifffile.imwrite(path, GREY, iccprofile=broken)
+        assert declared_tone(path) is None
+    assert declared_tone(tmp_path / "missing.tif") is None
+
+
+PX_PER_MM, SIDE_PX = 10.0, 320
+PLACES = ((8.0, -8.0), (-8.0, -8.0), (-8.0, 8.0), (8.0, 8.0))
+Array = np.ndarray
+
+
+def sharpened(codes: Array, amount: float, radius_px: float) -> Array:
+    return np.asarray(codes + amount * (codes - gaussian_filter(codes, radius_px, mode="nearest")))
+
+
+def frame(
+    rng: np.random.Generator, amount: float, radius_px: float, tone: float = 1.6
+) -> tuple[measure.FrameMeasurement, Array]:
+    """Four dark crosses on film with grain, coded and sharpened, as they were measured, and where they are."""
+    kind, linear, middle = KIND["cross"], PX_PER_MM * np.diag([1.0, -1.0]), SIDE_PX / 2 + rng.uniform(-0.5, 0.5, 2)
+    light, true_px = 0.5 + 0.008 * rng.standard_normal((SIDE_PX, SIDE_PX)), []
+    for place in PLACES:
+        mark = some_mark(kind, 0.8, rng)
+        corner = np.rint(linear @ place + middle).astype(int) - mark.size // 2
+        mark = replace(mark, place=np.column_stack([linear, linear @ place + middle - corner]))
+        light[corner[1] :, corner[0] :][: mark.size, : mark.size] -= 0.25 * mark.picture
+        true_px.append(linear @ place + middle)
+    marks = tuple(LayoutMark(str(n), place, (0.005, 0.005), kind.shape) for n, place in enumerate(PLACES))
+    scan = make_scan(FULL * np.clip(sharpened(light ** (1 / tone), amount, radius_px), 0.0, 1.0))
+    options, pitch_um = measure.FiducialOptions(pose="0"), 1000 / PX_PER_MM
+    layout = FiducialLayout(tuple(marks), (17.0, 17.0))
+    return measure.measure_fiducials(
+        scan.replace_tone(Tone.unknown()), layout, (pitch_um, pitch_um), options
+    ), np.array(true_px)
+
+
+@pytest.mark.parametrize(("amount", "radius_px"), [(0.5, 0.7), (1.5, 1.2), (2.0, 3.0)])
+def test_what_an_unsharp_mask_did_is_undone(amount: float, radius_px: float) -> None:
+    codes = gaussian_filter(np.random.default_rng(1).standard_normal((120, 110)), 1.0)
+    mask = Sharpening(amount, radius_px)
+    reach = mask.reach_px
+    undone = mask.undone(sharpened(codes, amount, radius_px))
+    inner = np.s_[reach:-reach, reach:-reach] if 2 * reach < 100 else np.s_[40:-40, 40:-40]
+    np.testing.assert_allclose(undone[inner], codes[inner], atol=0.01 * codes.std())
+    step = 1e-4
+    more = Sharpening(amount + step, radius_px), Sharpening(amount, radius_px * np.exp(step))
+    for change, other in zip(mask.changes(undone), more, strict=True):
+        by_step = (undone - other.undone(mask_codes := sharpened(codes, amount, radius_px))) / step
+        assert mask_codes.shape == change.shape
+        np.testing.assert_allclose(change[inner], by_step[inner], atol=0.02 * np.abs(change).max())
+
+
+def test_a_window_is_read_as_it_was_before_the_scan_was_sharpened() -> None:
+    codes = 30000 + 8000 * gaussian_filter(np.random.default_rng(2).standard_normal((150, 150)), 1.5)
+    mask = Sharpening(1.5, 1.2)
+    scan = make_scan(sharpened(codes, 1.5, 1.2)).replace_tone(Tone().sharpened(mask))
+    np.testing.assert_allclose(scan.light(60, 50, 40, 30), codes[50:80, 60:100], atol=20)
+
+
+def test_sharpening_is_estimated_from_marks_which_are_measured_where_they_are() -> None:
+    result, true_px = frame(np.random.default_rng(4), 1.5, 1.2)
+    assert result.tone is not None
+    found = result.tone.tone.sharpening
+    off = np.array([found.amount - 1.5, np.log(found.radius_px / 1.2)])
+    assert off @ np.linalg.solve(found.covariance, off) < 14  # two figures, p = 0.001
+    assert 0.7 < found.amount < 2.5
+    assert "sharpened, by an amount of" in result.tone.note
+    for mark, place in zip(result.marks, true_px, strict=True):
+        assert mark.status is Status.MEASURED, mark.reason
+        assert chi_square(mark, place) < 14
+        assert mark.covariance
+        assert Cause.SHARPENING in mark.covariance.parts
+        assert mark.quality["damaged_fraction"] < 0.05
+
+
+def test_a_scan_that_is_not_sharpened_is_not_taken_for_one() -> None:
+    result, _ = frame(np.random.default_rng(4), 0.0, 1.0)
+    assert result.tone is not None
+    assert not result.tone.tone.sharpening
+    assert "sharpened" not in result.tone.note
+    assert all(mark.covariance and Cause.SHARPENING not in mark.covariance.parts for mark in result.marks)
+
+
+def test_scans_of_a_scanner_say_together_how_it_sharpens() -> None:
+    own = [Sharpening(amount, 1.2, np.diag([0.04, 0.01])) for amount in (1.3, 1.5, 1.7)]
+    pooled = Sharpening.pooled(own)
+    assert pooled.amount == pytest.approx(1.5)
+    assert pooled.radius_px == pytest.approx(1.2)
+    assert 0.1 < np.sqrt(pooled.covariance[0, 0]) < 0.3
+    assert not Sharpening.pooled([own[0], Sharpening(), Sharpening()])  # most are not
+    information = [replace(ToneInformation.empty(), sharpening=each) for each in own]
+    known = Tone.unknown().include_information(information).sharpening
+    assert known.amount == pytest.approx(1.5)
+    assert known.prior is not None  # a scan's own marks add to it
+
+
+@pytest.mark.parametrize(("value", "is_taken"), [(0.8, True), (0.2, False), (-0.1, False), (4.5, False)])
+def test_a_curve_that_no_scanner_has_is_not_taken(value: float, is_taken: bool) -> None:
+    prior = Tone.unknown()
+    text = prior.shift_to_power(value).mean
+    matrix = 400.0 * np.eye(len(text))
+    information = ToneInformation(matrix, matrix @ text, float(text @ matrix @ text), len(text))
+    mark = MarkTone(information, np.full((2, len(text)), 0.1), 0.1, 0.9)
+    found = FrameTone.from_marks(prior, dict.fromkeys(range(8), mark), prior)
+    assert (found.tone.equivalent_power(0.1, 0.9)[0] == pytest.approx(value, abs=0.1)) == is_taken
+    assert ("was not taken" in found.note) == (not is_taken)
+    grown = np.trace(found.covariance_px2(mark)) > np.trace(FrameTone(prior).covariance_px2(mark))
+    assert grown == (not is_taken)
+
+
+# Annex K of ITU-T T.81, luminance, the first 15 in zigzag order: what "quality 50" is.
+COARSE = (16, 11, 12, 14, 12, 10, 16, 14, 13, 14, 18, 17, 16, 19, 24)
+
+
+@pytest.mark.parametrize(("quality", "share"), [(50, 1.0), (75, 0.5), (90, 0.2)])
+def test_the_step_is_that_of_the_luminance_table(quality: int, share: float) -> None:
+    grey = np.random.default_rng(1).integers(0, 255, (40, 40), np.uint8)
+    for picture in (grey, cv2.merge([grey, grey[::-1], grey])):
+        data = cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, quality))[1].tobytes()
+        expected = np.mean([max(int(step * share + 0.5), 1) for step in COARSE])
+        assert rounding_step_dn(data) == pytest.approx(expected)
+
+
+def test_tiff_files_have_it_too_and_what_is_not_compressed_with_loss_has_none(tmp_path: Path) -> None:
+    grey = np.random.default_rng(1).integers(0, 255, (64, 64), np.uint8)
+    for level, least, most in ((50, 14.0, 16.0), (90, 2.0, 4.0)):
+        path = tmp_path / f"{level}.tif"
+        tifffile.imwrite(path, grey, tile=(32, 32), compression="jpeg", compressionargs={"level": level})
+        with measure.open_scan(path) as scan:
+            assert least < scan.rounding_step_dn < most
+            assert scan.is_lossy
+    tifffile.imwrite(tmp_path / "whole.tif", grey, compression="lzw")
+    with measure.open_scan(tmp_path / "whole.tif") as scan:
+        assert scan.rounding_step_dn == 0.0
+        assert not scan.is_lossy
+
+
+def film() -> NDArray[np.uint8]:
+    """Grain on a ground that changes slowly, in grey values that JPEG has not seen."""
+    rng, cols = np.random.default_rng(3), np.arange(401)
+    grain = cv2.GaussianBlur(rng.normal(0.0, 60.0, (397, 401)), (0, 0), 1.0)
+    return np.asarray(np.clip(120 + 40 * np.sin(cols / 90) + grain, 0, 255).round().astype(np.uint8))
+
+
+def stored_after_jpeg(picture: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+    data = cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, quality))[1]
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED), np.uint8)
+
+
+@pytest.mark.parametrize(("quality", "share"), [(50, 1.0), (75, 0.5), (90, 0.2)])
+def test_a_file_without_loss_tells_that_its_picture_was_jpeg(quality: int, share: float, tmp_path: Path) -> None:
+    """Cropped, in colour, in 16 bits; and stored as a finer JPEG."""
+    was = stored_after_jpeg(film(), quality)[3:, 5:]
+    colour = stored_after_jpeg(np.dstack([film(), film()[::-1], film()]), quality)
+    expected = np.mean([max(int(step * share + 0.5), 1) for step in COARSE])
+    tifffile.imwrite(tmp_path / "grey.tif", was)
+    tifffile.imwrite(tmp_path / "deep.tif", was.astype(np.uint16) * 257)
+    cv2.imwrite(str(tmp_path / "colour.png"), colour)
+    cv2.imwrite(str(tmp_path / "again.jpg"), was, (cv2.IMWRITE_JPEG_QUALITY, 98))
+    for name, unit in (("grey.tif", 1), ("deep.tif", 257), ("colour.png", 1), ("again.jpg", 1)):
+        with measure.open_scan(tmp_path / name) as scan:
+            assert scan.rounding_step_dn == pytest.approx(unit * expected, rel=0.05)
+            assert "was compressed as JPEG before" in scan.notes[-1]
+
+
+def test_faint_marks_that_jpeg_rounds_are_as_far_off_as_is_stated() -> None:
+    """Of a contrast of three, four and six rounding steps: the rms error over the claim, both measured at once. What
+    residuals do not show falls with the square of the contrast: one that fell with it would be twice too large."""
+    rng, mark, ratios = (
+        np.random.default_rng(2),
+        measure.MarkShape(measure.ring_cross(1.0, 0.2, 1.6, 0.15, angle_deg=45.0)),
+        [],
+    )
+    even = np.zeros((48, 48), np.uint8)
+    step_dn = rounding_step_dn(cv2.imencode(".jpg", even, (cv2.IMWRITE_JPEG_QUALITY, 30))[1].tobytes())
+    for number in range(24):
+        middle = 23.5 + rng.uniform(-4, 4, 2)
+        place = placed(10.0, (middle[0], middle[1]), rng.uniform(0.02, 0.05))
+        picture, noise = brute_picture(mark, place, 48, 48, 1.2), rng.normal(0, 3, (48, 48))
+        contrast_dn = (3, 4, 6)[number % 3] * step_dn
+        grey = np.clip(np.rint(60 + contrast_dn * picture + noise), 0, 255).astype(np.uint8)
+        start = placed(10.0, tuple(place[:, 2] + rng.uniform(-0.5, 0.5, 2)))
+        fit = measure.match(measure.ScanWindow(stored_after_jpeg(grey, 30).astype(float), is_lossy=True), mark, start)
+        variance = np.trace(fit.covariance_px2 + covariance_of_compression(step_dn, fit.contrast_dn)) / 2
+        ratios.append((fit.center_px - place[:, 2]) / np.sqrt(variance))
+    assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.25

@@ -50,11 +50,11 @@ def rendered_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The project of the demonstration's first frames, not yet run. Tests copy it before they change anything."""
     scenes = tmp_path_factory.mktemp("scenes")
     for name in ("demo.toml", "metric_camera.toml"):
-        text = resources.files("synthetic_images").joinpath("scenes", name).read_text(encoding="utf-8")
+        text = resources.files("synthetic_images").joinpath("scenes", name).read_text()
         for many, few in FEWER_TARGETS.items():
             text = text.replace(many, few)
         head, *images = text.split("[[image]]")
-        (scenes / name).write_text("[[image]]".join([head, *images[:FRAMES]]), encoding="utf-8")
+        (scenes / name).write_text("[[image]]".join([head, *images[:FRAMES]]))
     folder = tmp_path_factory.mktemp("demo")
     render_project(scenes / "demo.toml", folder)
     return folder

@@ -34,7 +34,7 @@ def colmap_px(folder: Path, image: str, points: Array) -> Array:
 def asp_px(folder: Path, image: str, points: Array) -> Array:
     """(u, v) = distorted (fu, fv) (x, y) / z + (cu, cv), over the pitch; TSAI as OpenCV's, of x / z, y / z; FISHEYE:
     theta_d / r of them, theta_d a polynomial of theta = arctan r."""
-    lines = (folder / f"{image}.tsai").read_text(encoding="utf-8").splitlines()
+    lines = (folder / f"{image}.tsai").read_text().splitlines()
     assert lines[:2] == ["VERSION_4", "PINHOLE"]
     pairs = [line.split("=") for line in lines if "=" in line]
     given = {key.strip(): [float(part) for part in value.split()] for key, value in pairs}

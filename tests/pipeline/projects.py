@@ -61,7 +61,7 @@ def write_tables(folder: Path, project: str, **tables: str | Sequence[str]) -> P
     for name, text in {"project": project, **tables}.items():
         ending = "toml" if name in ("project", "camera") else "csv"
         lines = [text] if isinstance(text, str) else text
-        (folder / f"{name}.{ending}").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        (folder / f"{name}.{ending}").write_text("\n".join(lines) + "\n")
     return folder / "project.toml"
 
 
@@ -77,11 +77,11 @@ PROJECT = f'camera = "camera.toml"\nscans = ["*.tif"]\npitch_um = {PITCH_UM}\n[m
 def write_project(folder: Path, names: Sequence[str], project: str = PROJECT, layout: FiducialLayout = ALIKE) -> Path:
     """project.toml with its camera and its scans, which show that layout; the frames differ in noise and turn."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "camera.toml").write_text(CAMERA, encoding="utf-8")
+    (folder / "camera.toml").write_text(CAMERA)
     for seed, name in enumerate(names, 1):
         grey = frame_picture(layout, pixel_from_camera("0", 0.004 * seed), seed)
         tifffile.imwrite(folder / f"{name}.tif", np.clip(np.rint(grey), 0, 65535).astype(np.uint16))
-    (folder / "project.toml").write_text(project, encoding="utf-8")
+    (folder / "project.toml").write_text(project)
     return folder / "project.toml"
 
 
@@ -154,17 +154,17 @@ def adjusted_project(folder: Path, truth: Truth = TRUTH, crs: str = "", kind: st
 def make_project(network: Network, folder: Path, crs: str = "") -> Path:
     """The same of a network, whose frames may be in parts."""
     path = write_network_project(network, folder)
-    text = path.read_text(encoding="utf-8")
+    text = path.read_text()
     more = f'crs = "{crs}"\n' if crs else ""
     if any(image.part_of for image in network.images):
         rows = "".join(f"{image.name},{image.part_of}\n" for image in network.images)
-        (folder / "images.csv").write_text(f"image,part_of\n{rows}", encoding="utf-8")
+        (folder / "images.csv").write_text(f"image,part_of\n{rows}")
         more += 'images = "images.csv"\n'
     text = text.replace("[object]\n", f"[object]\n{more}")
-    path.write_text(f'scans = ["scans/*.tif"]\npitch_um = {1000.0 * PITCH_MM}\n{text}', encoding="utf-8")
+    path.write_text(f'scans = ["scans/*.tif"]\npitch_um = {1000.0 * PITCH_MM}\n{text}')
     comparator = folder / "comparator.csv"
-    marks = comparator.read_text(encoding="utf-8")
-    comparator.write_text(f"# comparator coordinates, reseau\n{marks}", encoding="utf-8")
+    marks = comparator.read_text()
+    comparator.write_text(f"# comparator coordinates, reseau\n{marks}")
     (folder / "scans").mkdir()
     for image in network.images:
         empty = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
@@ -211,21 +211,21 @@ def frame_px(image: int, places_mm: Array, ideal: bool = False, truth: Truth = T
 
 def stated_misfit_px(folder: Path) -> float:
     """The residual that the README tells."""
-    text = (folder / "README.txt").read_text(encoding="utf-8")
+    text = (folder / "README.txt").read_text()
     return float(text[text.index("off by ") + 7 :].split()[0])
 
 
 def result_file(folder: Path) -> dict[str, Any]:
     """What out/adjustment.json of a project's folder holds."""
-    content: dict[str, Any] = json.loads((folder / "out" / "adjustment.json").read_text(encoding="utf-8"))
+    content: dict[str, Any] = json.loads((folder / "out" / "adjustment.json").read_text())
     return content
 
 
 def replace_text(path: Path, old: str, new: str) -> None:
     """The first place of a file's text that reads so, otherwise."""
-    text = path.read_text(encoding="utf-8")
+    text = path.read_text()
     assert old in text
-    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    path.write_text(text.replace(old, new, 1))
 
 
 def change_project(old: str, new: str) -> Spoil:
@@ -319,13 +319,11 @@ def comparator_points(
         mm_from_px = np.diag([1.0, -1.0] * np.array(pitch_um[frame.image])) / 1000.0
         for mark in frame.marks:
             xy_mm = None if mark.center_px is None else mm_from_px @ mark.center_px
-            sigma_mm, rho = None, 0.0
+            s_mm, rho = None, 0.0
             if mark.covariance_px2 is not None:
                 (xx, xy), (_, yy) = mm_from_px @ mark.covariance_px2 @ mm_from_px
-                sigma_mm, rho = np.sqrt([xx, yy]), float(xy / np.sqrt(xx * yy))
-            yield ComparatorPoint(
-                frame.image, mark.point, mark.kind, xy_mm, sigma_mm, rho, mark.status, str(mark.reason)
-            )
+                s_mm, rho = np.sqrt([xx, yy]), float(xy / np.sqrt(xx * yy))
+            yield ComparatorPoint(frame.image, mark.point, mark.kind, xy_mm, s_mm, rho, mark.status, str(mark.reason))
 
 
 def scan_content(file: Path) -> bytes:

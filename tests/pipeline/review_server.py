@@ -25,7 +25,7 @@ FAR_TURN_RAD = 0.35  # of TURNED: no search looks for a frame that is laid so
 def write_faults(folder: Path) -> Path:
     """Four frames: one without fault; of one mark 3 is not there; of one it is scratched; one lies askew."""
     folder.mkdir(parents=True)
-    (folder / "camera.toml").write_text(CAMERA, encoding="utf-8")
+    (folder / "camera.toml").write_text(CAMERA)
     for seed, name in enumerate((GOOD, BARE, SCRATCHED, TURNED), 1):
         grey = frame_picture(ALIKE, mark_matrix(name), seed)
         col, row = np.rint(mark_px(name, "3")).astype(int)
@@ -35,7 +35,7 @@ def write_faults(folder: Path) -> Path:
         if name == SCRATCHED:
             grey[row - 30 : row + 31, col + 1 : col + 9] = 14000
         tifffile.imwrite(folder / f"{name}.tif", np.clip(np.rint(grey), 0, 65535).astype(np.uint16))
-    (folder / "project.toml").write_text(PROJECT, encoding="utf-8")
+    (folder / "project.toml").write_text(PROJECT)
     return folder / "project.toml"
 
 
@@ -93,11 +93,11 @@ def cursor(page: Page, view: str) -> Array:
 
 
 def decisions(folder: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (folder / "decisions.jsonl").read_text(encoding="utf-8").splitlines()]
+    return [json.loads(line) for line in (folder / "decisions.jsonl").read_text().splitlines()]
 
 
 def comparator(folder: Path) -> Mapping[tuple[str, str], Mapping[str, str]]:
-    lines = (folder / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    lines = (folder / "comparator.csv").read_text().splitlines()
     rows = csv.DictReader(line for line in lines if not line.startswith("#"))
     return {(row["image"], row["point"]): row for row in rows}
 

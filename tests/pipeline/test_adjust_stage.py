@@ -8,34 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import networks as nets
 import numpy as np
+import projects
 import pytest
-from networks import (
-    BOARD_FRAME_MM,
-    BOARD_TRUTH,
-    Truth,
-    board_network,
-    field_points,
-    film_parameters,
-    set_camera,
-    simulated,
-)
-from projects import (
-    Capture,
-    Printed,
-    Refusal,
-    command,
-    fiducial_tables,
-    present,
-    replace_text,
-    result_file,
-    write_network_project,
-    write_tables,
-)
+from projects import write_network_project as write_network
 from real_data import DATA, needs
 from reference_cases import CASES, case_network, load
 from studies import parametrize_with_studies
-from test_bent_boards import BENDS_MM, bent_board, make_network
+from test_condition_equations import BENDS_MM, bent_board, make_network
 
 from adjust import Adjustment, Distortion, Parameter, Prior
 from adjust.functional_model.rotation import rotation_from_angles
@@ -47,6 +28,7 @@ from pipeline.cli import DONE, LOOK
 from pipeline.opencv_check.check import check_against_opencv
 from pipeline.report import ReportData
 from pipeline.report.verdict import judge
+from pipeline.results.adjustment_file import read_own_covariance
 from pipeline.results.adjustment_record import AdjustmentRecord
 
 NAMES = sorted(path.stem for path in CASES.glob("*.json") if not path.stem.startswith("v_"))
@@ -79,7 +61,7 @@ def test_reference_case_through_files(name: str, tmp_path: Path) -> None:
 def full_name(parameter: str) -> str:
     """The name that a parameter of a case has in the adjustment: EO2.X0 is EO.2.X0, FID3.x is FID.C.3.x."""
     owner, name = parameter.split(".")
-    kind, id = present(re.fullmatch(r"([A-Z]+)(.*)", owner)).groups()
+    kind, id = projects.present(re.fullmatch(r"([A-Z]+)(.*)", owner)).groups()
     return ".".join([kind, *["C"] * (kind in ("IO", "FID")), *[id] * bool(id), name])
 
 
@@ -87,7 +69,7 @@ def write_project(case: dict[str, Any], folder: Path) -> Path:
     """The case as a user would write it."""
     network = case_network(case)
     camera = replace(network.cameras[0], name="C")
-    return write_network_project(replace(network, cameras=(camera,)), folder, frame_mm="")
+    return projects.write_network_project(replace(network, cameras=(camera,)), folder, frame_mm="")
 
 
 def free_project(folder: Path, adjust: str = "", objects: str = "", scale: float = 1.0) -> dict[str, Any]:
@@ -96,8 +78,8 @@ def free_project(folder: Path, adjust: str = "", objects: str = "", scale: float
     case["input"]["pts_obs"] = [[scale * x for x in row] for row in case["input"]["pts_obs"]]
     case["input"]["pts_sigma"] = [[None] * 3 for _ in case["input"]["pts_sigma"]]
     project = write_project(case, folder)
-    replace_text(project, "[object]\n", f"[object]\n{objects}\n")
-    project.write_text(f"{project.read_text(encoding='utf-8')}\n{adjust}\n", encoding="utf-8")
+    projects.replace_text(project, "[object]\n", f"[object]\n{objects}\n")
+    project.write_text(f"{project.read_text(encoding='utf-8')}\n{adjust}\n")
     return case
 
 
@@ -135,7 +117,7 @@ def test_distances_through_files(tmp_path: Path) -> None:
     rows = ["from,to,distance,sigma", "1,lost,3.0,0.1"]
     for a, b, scale in ((1, 2, 1.0), (3, 9, 1.0), (5, 7, 1.01)):
         rows.append(f"{a},{b},{scale * float(np.linalg.norm(xyz[b - 1] - xyz[a - 1]))!r},0.2")
-    (tmp_path / "bars.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    (tmp_path / "bars.csv").write_text("\n".join(rows) + "\n")
     with (tmp_path / "points.csv").open("a", encoding="utf-8") as points:
         points.write("lost,0.0,0.0,0.0,,,\n")
     result = adjust_network(tmp_path)
@@ -179,7 +161,7 @@ def once_more(earlier: Path, folder: Path, **changes: tuple[str, str]) -> Adjust
     for file in ("project.toml", "camera.toml", "points.csv", "comparator.csv"):
         shutil.copy(earlier / file, folder)
     for name, change in changes.items():
-        replace_text(folder / f"{name}.toml", *change)
+        projects.replace_text(folder / f"{name}.toml", *change)
     return adjust_network(folder)
 
 
@@ -195,7 +177,7 @@ def test_observed_antennas_through_files(earlier: tuple[Path, Adjustment], sigma
         antenna = place[:3] + rotation_from_angles(place[3:]).T @ offset
         values = [*antenna.tolist(), *np.degrees(place[3:]).tolist()]
         rows.append(",".join([image.name, *map(repr, values), *[sigma] * 3]))
-    (tmp_path / "images.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    (tmp_path / "images.csv").write_text("\n".join(rows) + "\n")
     keys = f'[object]\nimages = "images.csv"\nantenna_offset = {list(offset)}\n'
     if sigma == "0":
         with pytest.raises(InputError, match="column sX0: is 0, but an antenna can be observed only"):
@@ -239,7 +221,7 @@ def fiducial_project(folder: Path, **errors: float) -> Path:
     """Eight affine frames of the fiducials alone, whose coordinates are free, and their distances."""
     place = {"1": (-106.0, 106.0), "2": (106.0, 106.0), "3": (106.0, -106.0), "4": (-106.0, -106.0)}
     true = {id_: np.array(xy) + shift for (id_, xy), shift in zip(place.items(), [0.0, 0.03, -0.02, 0.05], strict=True)}
-    lines = ['name = "K"', "frame_mm = [228.0, 228.0]", fiducial_tables(place, 'sigma_mm = "free"\n')]
+    lines = ['name = "K"', "frame_mm = [228.0, 228.0]", projects.fiducial_tables(place, 'sigma_mm = "free"\n')]
     for start, end in SIX_DISTANCES:
         length = float(np.linalg.norm(true[end] - true[start])) + errors.get(f"from{start}to{end}", 0.0)
         lines += ["[[fiducial_distance]]", f'from = "{start}"', f'to = "{end}"', f"mm = {length!r}", "sigma_mm = 0.005"]
@@ -249,10 +231,10 @@ def fiducial_project(folder: Path, **errors: float) -> Path:
         for id_, xy in true.items():
             x, y = (film @ xy + 3.0 + 0.003 * rng.standard_normal(2)).tolist()
             rows.append(f"{image},{id_},fiducial,{x!r},{y!r},0.003,0.003")
-    return write_tables(folder, 'camera = "camera.toml"', camera=lines, comparator=rows)
+    return projects.write_tables(folder, 'camera = "camera.toml"', camera=lines, comparator=rows)
 
 
-def test_distances_between_fiducials_through_files(tmp_path: Path, printed_line: Printed) -> None:
+def test_distances_between_fiducials_through_files(tmp_path: Path, printed_line: projects.Printed) -> None:
     """Affine films tell no form; six distances of a certificate do, with one to spare, and their table is written."""
     assert "1 to 3: 299.81" in printed_line("run", fiducial_project(tmp_path))
     written = read_adjustment(tmp_path / "out" / "adjustment.json")
@@ -282,9 +264,9 @@ def test_interior_orientation_has_the_published_residuals(kind: str, tmp_path: P
         for m in marks:
             x, y = (0.016 * float(m[f"img{image}_{axis}_px"]) for axis in "xy")
             rows.append(f"{image},{m['id']},fiducial,{x},{y},0.005,0.005")
-    camera = 'name = "RC30"\n' + fiducial_tables(places, "sigma_mm = 0\n")
+    camera = 'name = "RC30"\n' + projects.fiducial_tables(places, "sigma_mm = 0\n")
     project = f'camera = "camera.toml"\n[adjust]\ntransformation = "{kind}"'
-    result = adjust_network(write_tables(tmp_path, project, camera=camera, comparator=rows).parent)
+    result = adjust_network(projects.write_tables(tmp_path, project, camera=camera, comparator=rows).parent)
     for image, expected in zip(("3574", "3575"), rms_um, strict=True):
         v_um = 1e3 * result.residuals.v_mm[np.array(result.network.observations.image) == image]
         assert np.sqrt((v_um**2).mean(axis=0)) == pytest.approx(expected, abs=0.06)
@@ -302,8 +284,10 @@ def test_the_affine_transformation_of_eight_fiducials_is_the_published_one(tmp_p
     rows += [
         f"left,{m['id']},fiducial,{pitch_mm * float(m['x_px'])},{-pitch_mm * float(m['y_px'])},1e-4,1e-4" for m in marks
     ]
-    camera = 'name = "SJU"\n' + fiducial_tables(places, "sigma_mm = 1\n")
-    result = adjust_network(write_tables(tmp_path, 'camera = "camera.toml"', camera=camera, comparator=rows).parent)
+    camera = 'name = "SJU"\n' + projects.fiducial_tables(places, "sigma_mm = 1\n")
+    result = adjust_network(
+        projects.write_tables(tmp_path, 'camera = "camera.toml"', camera=camera, comparator=rows).parent
+    )
     found = {name: result.value(f"T.left.{name}") for name in ("a1", "a2", "a3", "b1", "b2", "b3")}
     per_px = [pitch_mm * found["a2"], -pitch_mm * found["a3"], pitch_mm * found["b2"], -pitch_mm * found["b3"]]
     assert per_px == pytest.approx([0.041989, 0.000144, 0.000147, -0.041985], abs=6e-7)
@@ -312,9 +296,9 @@ def test_the_affine_transformation_of_eight_fiducials_is_the_published_one(tmp_p
 
 
 def test_film_is_added_to_the_covariance_of_every_mark(tmp_path: Path) -> None:
-    network, _ = simulated(np.random.default_rng(1))
-    path = write_network_project(network, tmp_path)
-    path.write_text(path.read_text(encoding="utf-8") + "film_sigma_um = 7.0\n", encoding="utf-8")
+    network, _ = nets.simulated(np.random.default_rng(1))
+    path = projects.write_network_project(network, tmp_path)
+    path.write_text(path.read_text() + "film_sigma_um = 7.0\n")
     project = read_project(path)
     built, left_out = build_network(project, read_comparator(project.comparator))
     assert not left_out
@@ -323,8 +307,8 @@ def test_film_is_added_to_the_covariance_of_every_mark(tmp_path: Path) -> None:
 
 
 def test_one_frame_with_too_few_fiducials_does_not_end_the_others(tmp_path: Path) -> None:
-    network, _ = simulated(np.random.default_rng(1))
-    project = read_project(write_network_project(network, tmp_path))
+    network, _ = nets.simulated(np.random.default_rng(1))
+    project = read_project(projects.write_network_project(network, tmp_path))
     marks = read_comparator(project.comparator)
     few = [mark for mark in marks if mark.kind != "fiducial" or mark.image != "f1" or mark.point in "12"]
     built, (left_out,) = build_network(project, few)
@@ -339,7 +323,7 @@ DRAWN_MM = 0.005  # of a pixel, as the pictures were projected
 
 def pixel_project(folder: Path, camera: str = "", project: str = "") -> Path:
     """Pictures of a board by a digital camera: a list of pixels, without fiducials and film."""
-    marks = board_network(np.random.default_rng(2), 6, 1e-4).observations
+    marks = nets.board_network(np.random.default_rng(2), 6, 1e-4).observations
     rows = ["image,point,col_px,row_px"]
     for image, point, (x_mm, y_mm) in zip(marks.image, marks.point, marks.xy_mm.tolist(), strict=True):
         rows.append(f"{image},{point},{x_mm / DRAWN_MM:.5f},{-y_mm / DRAWN_MM:.5f}")
@@ -347,7 +331,7 @@ def pixel_project(folder: Path, camera: str = "", project: str = "") -> Path:
     lens = '[distortion]\nfamily = "opencv"\n[distortion.sigma]\nk1 = "free"\nk2 = "free"'
     text = f'camera = "camera.toml"\n{project}[object]\npoints = "points.csv"\nunit = "mm"'
     points = ["point,X,Y,Z,sX,sY,sZ", *given]
-    return write_tables(folder, text, camera=f'name = "desk"\n{camera}{lens}', points=points, comparator=rows)
+    return projects.write_tables(folder, text, camera=f'name = "desk"\n{camera}{lens}', points=points, comparator=rows)
 
 
 def adjust_pixels(path: Path) -> Adjustment:
@@ -360,28 +344,30 @@ def test_a_digital_camera_comes_from_pixels_alone(tmp_path: Path, line: str, pit
     result = adjust_pixels(pixel_project(tmp_path, project=line))
     for name in ("c", "x0", "y0"):
         key = Parameter.interior("desk", name)
-        assert abs(result.value(key) / pitch_mm - BOARD_TRUTH[name] / DRAWN_MM) < 4.0 * result.sigma(key) / pitch_mm
+        assert (
+            abs(result.value(key) / pitch_mm - nets.BOARD_TRUTH[name] / DRAWN_MM) < 4.0 * result.sigma(key) / pitch_mm
+        )
     assert any("5 µm are assumed" in note for note in result.unused) == (not line)
 
 
 def test_a_camera_file_in_mm_needs_the_size_of_a_pixel(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="Set pitch_um in"):
-        adjust_pixels(pixel_project(tmp_path, camera=f"frame_mm = {[*BOARD_FRAME_MM]}\n"))
+        adjust_pixels(pixel_project(tmp_path, camera=f"frame_mm = {[*nets.BOARD_FRAME_MM]}\n"))
 
 
 def bent_project(folder: Path) -> Path:
     network = make_network(np.random.default_rng(5))
     free = {"principal_distance_mm": Prior(20.5, np.inf), "x0_mm": Prior(0.0, np.inf), "y0_mm": Prior(0.0, np.inf)}
-    network = set_camera(network, **free)
-    project = write_network_project(network, folder)
-    replace_text(project, "[object]\n", '[object]\nunit = "mm"\nboard_bend = "free"\n')
+    network = nets.set_camera(network, **free)
+    project = projects.write_network_project(network, folder)
+    projects.replace_text(project, "[object]\n", '[object]\nunit = "mm"\nboard_bend = "free"\n')
     return project
 
 
 def test_a_bent_board_from_the_project_file_to_the_report(tmp_path: Path) -> None:
     """Its bends within four sigmas, its points where they are and not on the plane, OpenCV in agreement there."""
-    assert command("run", bent_project(tmp_path)) in (DONE, LOOK)
-    result = result_file(tmp_path)
+    assert projects.command("run", bent_project(tmp_path)) in (DONE, LOOK)
+    result = projects.result_file(tmp_path)
     board = result["boards"]["board"]
     assert board["points"] == 70
     for name, value in zip(("bend_x", "bend_y"), BENDS_MM, strict=True):
@@ -391,58 +377,60 @@ def test_a_bent_board_from_the_project_file_to_the_report(tmp_path: Path) -> Non
     assert middle["sigma"] > 0.0
     assert abs(middle["value"] - bent_board()[34, 2]) < 4.0 * middle["sigma"]
     assert result["points"]["p0"]["Z"]["sigma"] == 0.0
-    check = json.loads((tmp_path / "out" / "check.json").read_text(encoding="utf-8"))
+    check = json.loads((tmp_path / "out" / "check.json").read_text())
     assert check["verdict"] == "agrees"
-    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    page = (tmp_path / "out" / "report.html").read_text()
     assert "The board of 70 points is bent" in page
 
 
-def test_points_that_are_no_board_are_reported(tmp_path: Path, refusal: Refusal) -> None:
+def test_points_that_are_no_board_are_reported(tmp_path: Path, refusal: projects.Refusal) -> None:
     project = bent_project(tmp_path)
-    points = (tmp_path / "points.csv").read_text(encoding="utf-8").splitlines()
+    points = (tmp_path / "points.csv").read_text().splitlines()
     moved = [",".join([*(cells := line.split(","))[:3], "90.0", *cells[4:]]) for line in points[1:20]]
-    (tmp_path / "points.csv").write_text("\n".join([points[0], *moved, *points[20:]]) + "\n", encoding="utf-8")
+    (tmp_path / "points.csv").write_text("\n".join([points[0], *moved, *points[20:]]) + "\n")
     assert "the object points are no board" in refusal("adjust", project)
 
 
-SCANS = Truth(middle_mm=(120.0, -115.0), mirrored=(False, True, False, False))
+SCANS = nets.Truth(middle_mm=(120.0, -115.0), mirrored=(False, True, False, False))
 
 
 @parametrize_with_studies(
     "kind", ["congruent", "projective", "bilinear", "conformal(2)", "polynomial(2)"], quick=(0, 1)
 )
 def test_films_of_every_kind_are_adjusted_from_files(kind: Transformation, tmp_path: Path) -> None:
-    points = field_points(np.random.default_rng(7), 16)
-    network, _ = simulated(np.random.default_rng(4), SCANS, kind, points)
-    write_network_project(network, tmp_path)
-    assert command("adjust", tmp_path / "project.toml") == (1 if kind == "polynomial(2)" else 0)  # too few marks
-    result = result_file(tmp_path)
+    points = nets.field_points(np.random.default_rng(7), 16)
+    network, _ = nets.simulated(np.random.default_rng(4), SCANS, kind, points)
+    projects.write_network_project(network, tmp_path)
+    assert projects.command("adjust", tmp_path / "project.toml") == (
+        1 if kind == "polynomial(2)" else 0
+    )  # too few marks
+    result = projects.result_file(tmp_path)
     assert result["converged"]
     for i in range(4):
         film = result["images"][f"f{i}"]["transformation"]
         assert film["kind"] == kind
         assert film["mirrored"] == (i == 1)
-        for name, truth in zip(film_parameter_names(kind), film_parameters(SCANS, i, kind), strict=True):
+        for name, truth in zip(film_parameter_names(kind), nets.film_parameters(SCANS, i, kind), strict=True):
             found, expected = (film["angle_deg"], np.degrees(truth)) if name == "angle" else (film[name], truth)
             off = (found["value"] - expected + 180.0) % 360.0 - 180.0 if name == "angle" else found["value"] - expected
             assert abs(off) <= 5.0 * found["sigma"]
-    assert command("check", tmp_path / "project.toml") in (0, 1)
-    assert command("report", tmp_path / "project.toml") in (0, 1)
+    assert projects.command("check", tmp_path / "project.toml") in (0, 1)
+    assert projects.command("report", tmp_path / "project.toml") in (0, 1)
 
 
 @parametrize_with_studies("given", ["none", "torlegard"])
-def test_the_project_is_reported_what_its_data_ask_for(given: str, tmp_path: Path, capsys: Capture) -> None:
+def test_the_project_is_reported_what_its_data_ask_for(given: str, tmp_path: Path, capsys: projects.Capture) -> None:
     """A lens without distortion: right as given without any, and to be looked at where k3 is estimated."""
-    points = field_points(np.random.default_rng(1), 15)
-    network, _ = simulated(np.random.default_rng(8), Truth(distortion={}), "none", points=points)
+    points = nets.field_points(np.random.default_rng(1), 15)
+    network, _ = nets.simulated(np.random.default_rng(8), nets.Truth(distortion={}), "none", points=points)
     parameters = {"k3": Prior(0.0, np.inf)} if given == "torlegard" else {}
     camera = replace(network.cameras[0], distortion=Distortion(given, parameters), fiducials={})
-    project = write_network_project(replace(network, cameras=(camera,)), tmp_path)
-    assert command("choose", project) == (DONE if given == "none" else LOOK)
+    project = projects.write_network_project(replace(network, cameras=(camera,)), tmp_path)
+    assert projects.command("choose", project) == (DONE if given == "none" else LOOK)
     shown = " ".join(capsys.readouterr().out.split())
     assert "Selected: no distortion" in shown
     assert ("the given model." in shown) is (given == "none")
-    result = json.loads((tmp_path / "out" / "choose.json").read_text(encoding="utf-8"))
+    result = json.loads((tmp_path / "out" / "choose.json").read_text())
     assert result["chosen"] == {"transformation": "none", "family": "none", "parameters": [], "bends": {}}
     names = [each["name"] for each in result["candidates"]]
     assert names[:3] == ["no distortion", "torlegard k3", "torlegard k3 k5"]
@@ -453,3 +441,203 @@ def test_the_project_is_reported_what_its_data_ask_for(given: str, tmp_path: Pat
     assert result["tests"][0] | {"F": 0, "p": 0} == {
         "simpler": "no distortion", "richer": "torlegard k3", "F": 0, "degrees": [1, first["redundancy"] - 1], "p": 0,
     }  # fmt: skip
+
+
+GIVEN = {"1": (-106.0, 106.0), "2": (106.0, 106.0), "3": (106.0, -106.0), "4": (-106.0, -106.0), "5": (0.0, 112.0)}
+AFFINE = np.array([[1.001, 0.02], [-0.021, 0.999]])
+SHIFT = np.array([-118.0, 121.0])
+SIGMA_MM = 0.004
+
+
+def comparator_mm(seed: int, count: int = 5) -> np.ndarray:
+    camera = np.array(list(GIVEN.values()))[:count]
+    noise = np.random.default_rng(seed).normal(0.0, SIGMA_MM, camera.shape)
+    return np.linalg.solve(AFFINE, (camera - SHIFT).T).T + noise
+
+
+def write_fiducials_project(
+    folder: Path, marks: dict[str, int], camera: str = "", extra: tuple[str, ...] = (), sigma_mm: float = 0.0
+) -> Path:
+    """Frames by name with so many fiducials each, of which the camera knows that much, and further marks' lines."""
+    text = f'name = "K"\n{camera}\n' + projects.fiducial_tables(GIVEN, f"sigma_mm = {sigma_mm}\n")
+    rows = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm", *extra]
+    for seed, (image, count) in enumerate(marks.items()):
+        for id_, (x, y) in zip(GIVEN, comparator_mm(seed, count).tolist(), strict=False):
+            rows.append(f"{image},{id_},fiducial,{x!r},{y!r},{SIGMA_MM},{SIGMA_MM}")
+    return projects.write_tables(folder, 'camera = "camera.toml"', camera=text, comparator=rows)
+
+
+def test_film_transformations_without_an_object(tmp_path: Path, printed_line: projects.Printed) -> None:
+    """Against the linear least-squares fit, values and standard deviations; no orientation, no calibration."""
+    project = write_fiducials_project(tmp_path, {"a": 5, "b": 5, "c": 3})
+    text = printed_line("run", project)
+    assert "Film transformations from 13 marks in 3 frames; no frame is oriented, and no camera calibrated" in text
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert report.count("No exterior orientation") == 3
+    assert "Exterior orientation</caption>" not in report
+    assert "Film report</p>" in report
+    assert "Calibration report" not in report
+    assert projects.command("report", project) == 0  # and it may be written over
+    result = projects.result_file(tmp_path)
+    assert result["converged"]
+    assert (result["unknowns"], result["redundancy"]) == (18, 8)
+    for seed, image in enumerate(("a", "b")):
+        xy, camera = comparator_mm(seed), np.array(list(GIVEN.values()))
+        design = np.column_stack([np.ones(5), xy])
+        fitted = np.linalg.lstsq(design, camera)[0]
+        cofactor = np.linalg.inv(design.T @ design) * (SIGMA_MM * result["sigma0"]) ** 2
+        for axis, letter in enumerate("ab"):
+            for k in range(3):
+                found = result["images"][image]["transformation"][f"{letter}{k + 1}"]
+                sigma = float(np.sqrt(cofactor[k, k]))
+                assert found["value"] == pytest.approx(fitted[k, axis], abs=0.01 * sigma)
+                assert found["sigma"] == pytest.approx(sigma, rel=0.01)
+        assert {(one["value"], one["sigma"]) for one in result["images"][image]["exterior"].values()} == {(None, None)}
+    camera = result["cameras"]["K"]
+    assert camera["principal_distance_mm"] == {"value": None, "sigma": None}
+    assert camera["principal_point_mm"]["x"]["sigma"] is None
+
+
+def test_a_frame_without_enough_targets_keeps_its_film_transformation(tmp_path: Path) -> None:
+    target = ("a,t1,target,100.0,90.0,0.004,0.004",)
+    project = write_fiducials_project(tmp_path, {"a": 5, "b": 2}, "principal_distance_mm = 153.0", target)
+    (tmp_path / "points.csv").write_text("point,X,Y,Z\nt1,0,0,0\n")
+    project.write_text('camera = "camera.toml"\n[object]\npoints = "points.csv"\n')
+    assert projects.command("adjust", project) == 1
+    result = projects.result_file(tmp_path)
+    assert list(result["images"]) == ["a"]
+    assert {row["kind"] for row in result["residuals"]} == {"fiducial"}
+    warnings = " ".join(result["warnings"])
+    assert "Image 'a' is not oriented: it shows 1 targets and needs 3." in warnings
+    assert "Image 'b' has no part in the adjustment" in warnings
+    assert result["cameras"]["K"]["principal_distance_mm"]["value"] == 153.0
+    assert result["cameras"]["K"]["principal_distance_mm"]["sigma"] is None
+
+
+def test_the_film_transformation_can_be_chosen(tmp_path: Path, printed_line: projects.Printed) -> None:
+    """No lens to choose, but the kind of film: these marks have two scales that differ by 0.2 %."""
+    assert "Selected: affine, no distortion" in printed_line(
+        "choose", write_fiducials_project(tmp_path, {"a": 5, "b": 5})
+    )
+
+
+def test_the_form_of_the_fiducials_is_reported_where_they_are_estimated(
+    tmp_path: Path, printed_line: projects.Printed
+) -> None:
+    """Marks with a datum of 1 mm: no figure of mm is left in the form, and the dashes are gone."""
+    project = write_fiducials_project(tmp_path, {f"f{i}": 5 for i in range(60)}, sigma_mm=1.0)
+    text = printed_line("run", project)
+    assert re.search(r"K: Corrections to the certificate, after a common affine transformation: \d\.\d µm rms", text)
+    assert "the worst first (8 of 60)" in text
+    report = (tmp_path / "out" / "report.html").read_text()
+    form = report[report.index('<section id="fiducials">') : report.index('<section id="reliability">')]
+    row = r"<td>\d</td>\s*<td[^>]*>[+−][\d.]+</td><td[^>]*>([\d.]+)</td><td[^>]*>[+−][\d.]+</td><td[^>]*>([\d.]+)</td>"
+    sigmas_um = [float(text) for pair in re.findall(row, form) for text in pair]
+    assert len(sigmas_um) == 10
+    assert 0.05 < max(sigmas_um) < 1e3 * SIGMA_MM / np.sqrt(60)
+    assert "Distances" not in form
+
+
+def test_a_single_frame_with_a_mere_datum_has_a_priori_sigmas(tmp_path: Path, capsys: projects.Capture) -> None:
+    """sigma0 was 0.003 here, and multiplied the datum's 1 mm: now the shift is known to 1 mm over the root of 5."""
+    project = write_fiducials_project(tmp_path, {"a": 5}, sigma_mm=1.0)
+    projects.command("adjust", project)
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "standard deviations a priori" in printed
+    result = projects.result_file(tmp_path)
+    assert result["sigma0_from"] == {"redundancy": 0.0, "a_priori": True, "left_out": []}
+    design = np.column_stack([np.ones(5), comparator_mm(0)])
+    sigma = np.sqrt(np.linalg.inv(design.T @ design)[0, 0] * (1.0 + SIGMA_MM**2))
+    assert result["images"]["a"]["transformation"]["a1"]["sigma"] == pytest.approx(sigma, rel=1e-3)
+
+
+def test_one_frame_within_its_certificate_needs_no_attention(tmp_path: Path) -> None:
+    """Four calibrated fiducials of one frame, given to 10 µm and measured to 4 µm: nothing speaks against any."""
+    project = write_fiducials_project(tmp_path, {"a": 4}, sigma_mm=0.01)
+    assert projects.command("run", project) == 0
+    rows = (tmp_path / "comparator.csv").read_text().splitlines()
+    name, id_, kind, x, *rest = rows[1].split(",")
+    wrong = ",".join((name, id_, kind, str(float(x) + 0.4), *rest))  # 0.2 mm and more at each mark of an affine fit
+    (tmp_path / "comparator.csv").write_text("\n".join([rows[0], wrong, *rows[2:]]) + "\n")
+    assert projects.command("run", project) == 1
+
+
+POINT = "7"
+
+
+def spoilt_project(folder: Path, adjust: str) -> Path:
+    """The reference network with one target wrong by 0.1 mm."""
+    case = load("i_five_images_affine_reduced")
+    row = next(row for row in case["input"]["obs"] if str(row[1]) == POINT)
+    row[2] += 0.1
+    file = write_project(case, folder)
+    file.write_text(file.read_text() + adjust + "\n")
+    return file
+
+
+@parametrize_with_studies(
+    ("adjust", "removed"),
+    [("", False), ("snooping = true\nvariance_components = true", True), ('robust = "igg3"', True)],
+)
+def test_a_gross_error_is_named_in_file_and_report(adjust: str, removed: bool, tmp_path: Path) -> None:
+    project = spoilt_project(tmp_path, adjust)
+    assert projects.command("adjust", project) == 1
+    result = projects.result_file(tmp_path)
+    (suspect,) = result["suspects"]
+    name = f"target {POINT} in image {suspect['owner']}"
+    assert (suspect["name"], suspect["removed"]) == (name, removed)
+    assert suspect["error"][0] == pytest.approx(0.1, abs=0.02)
+    row = next(row for row in result["residuals"] if (row["image"], row["point"]) == (suspect["owner"], POINT))
+    assert (row["weight"] < 1e-9) is removed
+    assert row["smallest_error_x_um"] > 0.0
+    outer = {each["parameter"]: each for each in result["reliability"]["outer"]}
+    assert outer["IO.C.c"]["cause"]
+    given = {each["name"]: each for each in result["reliability"]["given"]}
+    assert given["given fiducial 3 x (camera C)"]["smallest_error"] > 0.0
+    assert projects.command("report", project) == 1
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert f"{'Left out as gross errors' if removed else '1 gross error suspected'}: {name} (w = " in report
+    assert "of an undetected error in" in report
+    if "variance" in adjust:
+        assert result["variance_sigmas"].keys() == {"target", "fiducial"}
+        assert "Variance components: factors of the variances" in report
+
+
+@parametrize_with_studies(("frame_mm", "level"), [(228.0, 0), (600.0, 1)])
+def test_a_lens_known_in_the_middle_alone_needs_attention(frame_mm: float, level: int, tmp_path: Path) -> None:
+    """Targets within some 110 mm of the principal point: most of a picture of 228 mm, a quarter of one of 600 mm."""
+    free = {"k3": np.inf, "k5": np.inf}
+    network, _ = nets.simulated(
+        np.random.default_rng(1), points=nets.field_points(np.random.default_rng(2), 40), free=free
+    )
+    project = write_network(network, tmp_path, f"frame_mm = [{frame_mm}, {frame_mm}]")
+    assert projects.command("adjust", project) == level
+    known = projects.result_file(tmp_path)["cameras"]["K"]["lens_known"]
+    assert (known["share"] < 0.5) is bool(level)
+    assert known["corner_sigma_um"] > known["sigma_um"] > 0.0
+    # By dr = k3 r³ + k5 r⁵ and the covariance that stands in adjustment.npz.
+    covariance = read_own_covariance(tmp_path / "out" / "adjustment.json")
+    of_terms = covariance.select([Parameter.interior("K", each) for each in ("k3", "k5")])
+    for radius, sigma in (("radius_mm", "sigma_um"), ("corner_mm", "corner_sigma_um")):
+        by_terms = 1e3 * known[radius] ** np.array([3.0, 5.0])
+        assert known[sigma] == pytest.approx(float(np.sqrt(by_terms @ of_terms @ by_terms)), rel=1e-6)
+    assert projects.command("report", project) in (0, level)
+    assert "of the way to the corner of the picture" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_points_that_no_image_shows_are_a_note_and_an_unknown_one_in_one_image_is_named(tmp_path: Path) -> None:
+    """A pattern is often larger than what the images show; one ray does not locate a point."""
+    network, _ = nets.simulated(np.random.default_rng(1), points=nets.field_points(np.random.default_rng(2), 40))
+    project = write_network(network, tmp_path)
+    points, marks = tmp_path / "points.csv", tmp_path / "comparator.csv"
+    points.write_text(points.read_text() + "u1,5,5,0,0,0,0\nu2,6,6,0,0,0,0\n")
+    assert projects.command("adjust", project) == 0
+    result = projects.result_file(tmp_path)
+    assert [note for note in result["notes"] if "measured in no image: 2 points, u1, u2" in note]
+    points.write_text(points.read_text() + "single,,,,,,\n")
+    marks.write_text(marks.read_text() + "f2,single,target,10,10,0.005,0.005\n")
+    assert projects.command("adjust", project) == 1
+    result = projects.result_file(tmp_path)
+    (warning,) = [warning for warning in result["warnings"] if "single" in warning]
+    assert "measured in one image only, and so left out: single (f2). Two images are needed" in warning
+    assert not any("single" in note for note in result["notes"])

@@ -12,18 +12,9 @@ import pytest
 from adjust import Adjustment, ObjectPoint, Prior
 from adjust.quality.run import Residuals
 from pipeline import InputError, read_adjustment, write_adjustment
-from pipeline.results import adjustment_content
+from pipeline.results import adjustment_content, stage_files
 from pipeline.results.adjustment_file import covariance_path, read_covariance
 from pipeline.results.record_json import plain_json
-from pipeline.results.stage_files import (
-    CameraCheck,
-    Check,
-    ComparedParameter,
-    CornersCheck,
-    Estimate,
-    PixelCalibration,
-    read_check,
-)
 
 
 @pytest.fixture
@@ -39,7 +30,7 @@ def path(adjustment: Adjustment, tmp_path: Path) -> Path:
 
 def file_content(path: Path) -> Any:
     """What the file holds."""
-    return json.loads(path.read_text(encoding="utf-8"))
+    return json.loads(path.read_text())
 
 
 def test_values_stand_with_a_posteriori_sigmas(adjustment: Adjustment, path: Path) -> None:
@@ -103,7 +94,7 @@ def test_a_singular_result_has_its_causes_no_sigmas_and_no_nan(tmp_path: Path) -
     def refuse(constant: str) -> NoReturn:
         raise AssertionError(f"{constant} is no JSON")
 
-    json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
+    json.loads(path.read_text(), parse_constant=refuse)
     content = file_content(path)
     assert not content["converged"]
     assert content["singular"][0]["parameters"] == ["IO.RC 20.c", "EO.f1.Z0"]
@@ -119,7 +110,7 @@ def test_what_is_read_is_what_was_written(adjustment: Adjustment, path: Path) ->
     assert plain_json(read_adjustment(path)) == file_content(path)
     content = file_content(path)
     content["groups"]["target"]["rms_x_um"] = content["residuals"][0]["w"] = None
-    path.write_text(json.dumps(content), encoding="utf-8")
+    path.write_text(json.dumps(content))
     record = read_adjustment(path)
     assert np.isnan([record.groups["target"].rms_x_um, record.residuals[0].w]).all()
     assert plain_json(record) == content
@@ -166,7 +157,7 @@ def test_a_broken_file_names_the_place(path: Path, keys: tuple[Any, ...], value:
     for key in keys[:-1]:
         inner = inner[key]
     inner[keys[-1]] = value
-    path.write_text(json.dumps(content), encoding="utf-8")
+    path.write_text(json.dumps(content))
     with pytest.raises(InputError, match=message):
         read_adjustment(path)
 
@@ -179,7 +170,7 @@ def test_a_missing_or_broken_file_is_named_with_what_to_do(path: Path) -> None:
     file.unlink()
     with pytest.raises(InputError, match="there is no such file"):
         read_covariance(path)
-    path.write_text('{"reseau": "0.1",\n oh', encoding="utf-8")
+    path.write_text('{"reseau": "0.1",\n oh')
     with pytest.raises(InputError, match=r"is not valid JSON .*line 2"):
         read_adjustment(path)
     path.unlink()
@@ -212,17 +203,19 @@ def test_a_large_network_is_in_blocks(adjustment: Adjustment, path: Path, monkey
 
 
 def test_a_check_is_read_as_it_was_written_and_a_wrong_value_refused_with_its_place(tmp_path: Path) -> None:
-    pixels = PixelCalibration(1.0, 2.0, 3.0, 4.0, 0.5)
-    corners = CornersCheck("findChessboardCorners", 3, 12, ("a",), pixels, pixels)
-    row = ComparedParameter.from_numbers("k1", "", Estimate(1.0, 0.1), Estimate(1.0, 0.1))
-    camera = CameraCheck("agrees", "All agree.", 3, 12, 1.0, 1.1, 0.1, (row,), corners)
+    pixels = stage_files.PixelCalibration(1.0, 2.0, 3.0, 4.0, 0.5)
+    corners = stage_files.CornersCheck("findChessboardCorners", 3, 12, ("a",), pixels, pixels)
+    row = stage_files.ComparedParameter.from_numbers(
+        "k1", "", stage_files.Estimate(1.0, 0.1), stage_files.Estimate(1.0, 0.1)
+    )
+    camera = stage_files.CameraCheck("agrees", "All agree.", 3, 12, 1.0, 1.1, 0.1, (row,), corners)
     path = tmp_path / "check.json"
 
-    def read(content: Any) -> Check:
-        path.write_text(json.dumps(content), encoding="utf-8")
-        return read_check(path)
+    def read(content: Any) -> stage_files.Check:
+        path.write_text(json.dumps(content))
+        return stage_files.read_check(path)
 
-    content = plain_json(Check.from_cameras({"K": camera}))
+    content = plain_json(stage_files.Check.from_cameras({"K": camera}))
     assert plain_json(read(content)) == content
     of_camera = content["cameras"]["K"]
     (of_row,) = of_camera["rows"]

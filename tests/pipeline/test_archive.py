@@ -11,27 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import projects
 import pytest
 import tifffile
 from drawn import lay_out
-from projects import (
-    CAMERA,
-    Capture,
-    Printed,
-    Refusal,
-    change_camera,
-    change_project,
-    command,
-    replace_text,
-    write_project,
-    write_tables,
-)
 from studies import parametrize_with_studies
 
 from measure import Code, MarkShape, Pose, Reason, Status, polygon
 from measure.fiducials.options import BelievedFilm
-from pipeline import read_project
-from pipeline.archive.checked_results import read_measurement
+from pipeline import read_measurement, read_project
 from pipeline.archive.schema import MEASUREMENTS, Schema, opened
 from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_doubt
@@ -58,7 +46,7 @@ def counts(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def three(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of three scans, not measured yet."""
-    return write_project(tmp_path_factory.mktemp("three"), ["a", "b", "c"]).parent
+    return projects.write_project(tmp_path_factory.mktemp("three"), ["a", "b", "c"]).parent
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +66,7 @@ def folder(done: Path, tmp_path: Path) -> Path:
 
 
 def measure(folder: Path, *options: str) -> int:
-    return command("measure", folder / "project.toml", *options)
+    return projects.command("measure", folder / "project.toml", *options)
 
 
 def marks(folder: Path) -> bytes:
@@ -101,11 +89,11 @@ CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "renamed": (lambda p: (p / "b.tif").rename(p / "e.tif"), "e"),
     "one more": (one_more, "d"),
     "one less": (lambda p: (p / "b.tif").unlink(), ""),
-    "excluded": (change_project("[measure]", 'exclude = ["b.tif"]\n[measure]'), ""),
-    "an option": (change_project('pose = "0"', 'pose = "0"\ntone = "linear"'), "abc"),
-    "a mark drawn otherwise": (change_camera("line_mm = 0.1\n", "line_mm = 0.11\n"), "abc"),
-    "an option of the adjustment": (change_project("[measure]", "[adjust]\nrobust = true\n[measure]"), ""),
-    "the camera's name": (change_camera('name = "K"', 'name = "L"'), ""),
+    "excluded": (projects.change_project("[measure]", 'exclude = ["b.tif"]\n[measure]'), ""),
+    "an option": (projects.change_project('pose = "0"', 'pose = "0"\ntone = "linear"'), "abc"),
+    "a mark drawn otherwise": (projects.change_camera("line_mm = 0.1\n", "line_mm = 0.11\n"), "abc"),
+    "an option of the adjustment": (projects.change_project("[measure]", "[adjust]\nrobust = true\n[measure]"), ""),
+    "the camera's name": (projects.change_camera('name = "K"', 'name = "L"'), ""),
     "a pose decided": (
         lambda p: (p / "decisions.jsonl").write_text('{"image": "b", "decision": "pose", "pose": "90"}\n'), "b"),
     "the marks' file deleted": (lambda p: (p / "comparator.csv").unlink(), ""),
@@ -131,7 +119,7 @@ def test_exactly_what_changed_is_measured_again(folder: Path, change: str) -> No
 def test_results_come_back_by_options_and_move_with_their_project(folder: Path, tmp_path: Path) -> None:
     before = marks(folder)
     for old, new in (('pose = "0"', 'pose = "0"\ntone = "linear"'), ('pose = "0"\ntone = "linear"', 'pose = "0"')):
-        replace_text(folder / "project.toml", old, new)
+        projects.replace_text(folder / "project.toml", old, new)
         measure(folder)
         assert len(measured) == 3
     assert marks(folder) == before
@@ -174,12 +162,12 @@ def test_moved_files_are_known_by_content_where_requested(folder: Path, monkeypa
     assert measured == ["c"]
 
 
-def test_bad_scans_have_a_verdict_and_the_others_are_measured(folder: Path, capsys: Capture) -> None:
+def test_bad_scans_have_a_verdict_and_the_others_are_measured(folder: Path, capsys: projects.Capture) -> None:
     """Beside one good scan: a truncated, a foreign and a black one, and one that is no picture."""
     good = [line for line in marks(folder).decode().splitlines() if line.startswith("a,")]
     (folder / "b.tif").write_bytes((folder / "b.tif").read_bytes()[:100_000])
     (folder / "c.tif").write_bytes(b"II*\0 and nothing that is right")
-    (folder / "foreign.tif").write_text("a letter", encoding="utf-8")
+    (folder / "foreign.tif").write_text("a letter")
     tifffile.imwrite(folder / "black.tif", np.zeros_like(tifffile.imread(folder / "a.tif")))
     assert measure(folder) == 1
     found = {"a": "good", "b": "failed", "c": "failed", "black": "poor", "foreign": "failed"}
@@ -193,7 +181,7 @@ def test_bad_scans_have_a_verdict_and_the_others_are_measured(folder: Path, caps
     assert not measured
     assert measure(folder, "--retry") == 1
     assert sorted(measured) == ["b", "c", "foreign"]
-    assert command("status", folder / "project.toml", "--verdict", "failed") == 1
+    assert projects.command("status", folder / "project.toml", "--verdict", "failed") == 1
     out, err = capsys.readouterr()
     assert "foreign" in out
     assert "Repair or replace" in out.replace("\n", " ")
@@ -213,7 +201,7 @@ def test_copies_count_once(folder: Path) -> None:
     assert verdicts(folder)["z"] in ("look", "poor")
 
 
-def test_a_full_disk_costs_no_result(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+def test_a_full_disk_costs_no_result(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: projects.Capture) -> None:
     before = marks(folder)
     one_more(folder)
 
@@ -234,18 +222,20 @@ def test_a_full_disk_costs_no_result(folder: Path, monkeypatch: pytest.MonkeyPat
     assert measured == ["d"]
 
 
-def test_shards_joined_are_the_same_as_one_machine(folder: Path, three: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_shards_joined_are_the_same_as_one_machine(
+    folder: Path, three: Path, tmp_path: Path, capsys: projects.Capture
+) -> None:
     parts = tmp_path / "parts"
     shutil.copytree(three, parts)
     project = parts / "project.toml"
     assert measure(parts, "--shard", "1/5") == 0
     assert not (parts / "comparator.csv").exists()
     store = parts / "out" / "measurement.{}-of-5.db"
-    assert command("merge", project, str(store).format(1)) == 1  # the others are waiting
+    assert projects.command("merge", project, str(store).format(1)) == 1  # the others are waiting
     assert "waiting" in capsys.readouterr().out
     assert measure(parts, "--shard", "2/5") == 0
     assert sorted(measured) == ["a", "b", "c"]
-    assert command("merge", project, *(str(store).format(k) for k in (1, 2))) == 0
+    assert projects.command("merge", project, *(str(store).format(k) for k in (1, 2))) == 0
     assert len(measured) == 3
     assert marks(parts) == marks(folder)
     assert measure(parts) == 0
@@ -253,7 +243,7 @@ def test_shards_joined_are_the_same_as_one_machine(folder: Path, three: Path, tm
 
 
 @pytest.mark.parametrize("shard", ["3", "0/2", "3/2", "a/b", "1/2/3"])
-def test_a_shard_that_is_none_is_refused(folder: Path, shard: str, capsys: Capture) -> None:
+def test_a_shard_that_is_none_is_refused(folder: Path, shard: str, capsys: projects.Capture) -> None:
     assert measure(folder, "--shard", shard) == 2
     assert "is not K/N" in capsys.readouterr().err
 
@@ -276,9 +266,9 @@ def test_a_new_scan_has_its_own_lot_checked_again_and_no_other(folder: Path, mon
     assert set(verdicts(folder)) == {"a", "b", "c", "d"}
 
 
-def test_status_tells_what_changed_outside(folder: Path, printed: Printed) -> None:
+def test_status_tells_what_changed_outside(folder: Path, printed: projects.Printed) -> None:
     project = str(folder / "project.toml")
-    assert command("status", project) == 0
+    assert projects.command("status", project) == 0
     one_more(folder)
     change_pixel(folder / "a.tif")
     os.utime(folder / "b.tif", ns=(1, 1))  # as in a copy
@@ -289,7 +279,7 @@ def test_status_tells_what_changed_outside(folder: Path, printed: Printed) -> No
     assert output["verdicts"]["good"]["scans"] == 1
     assert printed("status", project, "--csv", "--verdict", "waiting", code=1).splitlines()[1].startswith("d,waiting,")
     assert "No scan has this verdict." in printed("status", project, "--verdict", "failed", code=1)
-    assert command("status", project, "--verdict", "dreadful") == 2
+    assert projects.command("status", project, "--verdict", "dreadful") == 2
 
 
 def test_status_says_why_a_scan_needs_attention(folder: Path) -> None:
@@ -304,8 +294,7 @@ def test_status_says_why_a_scan_needs_attention(folder: Path) -> None:
 
 def test_the_pages_of_results_and_scans_have_the_tables_of_verdicts_and_failures() -> None:
     results, scans = (
-        (Path(__file__).parents[2] / "docs" / "reference" / name).read_text(encoding="utf-8")
-        for name in ("results.md", "scans.md")
+        (Path(__file__).parents[2] / "docs" / "reference" / name).read_text() for name in ("results.md", "scans.md")
     )
     assert all(f"| `{verdict}` | {verdict.meaning} | {NEXT_STEP[verdict]} |" in results for verdict in Verdict)
     assert all(f"| `{code}` | {code.meaning} |" in scans for code in FailureCode)
@@ -315,11 +304,11 @@ TIP_MM = ((0.0, 0.0), (0.8, -1.0), (0.8, 1.0))  # of a wedge, whose sides lean o
 
 
 @pytest.mark.study
-def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(tmp_path: Path, capsys: Capture) -> None:
+def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(tmp_path: Path, capsys: projects.Capture) -> None:
     folder = tmp_path / "p"
-    write_project(folder, ["a", "b"], layout=lay_out([MarkShape(polygon(TIP_MM))] * 4))
+    projects.write_project(folder, ["a", "b"], layout=lay_out([MarkShape(polygon(TIP_MM))] * 4))
     mark = f'[mark.m]\nkind = "polygon"\nvertices_mm = {[*map(list, TIP_MM)]}\n'
-    (folder / "camera.toml").write_text(CAMERA.split("[mark.m]")[0] + mark, encoding="utf-8")
+    (folder / "camera.toml").write_text(projects.CAMERA.split("[mark.m]")[0] + mark)
     measure(folder)
     assert "2 of 2 scans measured (2 in this run)" in capsys.readouterr().err  # this call measured them for the curve
     measured.clear()
@@ -332,7 +321,9 @@ def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(tmp_path: Path, caps
     assert measured == ["d"]
 
 
-def test_scans_that_fail_alike_are_reported_once_and_all_scans_are_counted(tmp_path: Path, refusal: Refusal) -> None:
+def test_scans_that_fail_alike_are_reported_once_and_all_scans_are_counted(
+    tmp_path: Path, refusal: projects.Refusal
+) -> None:
     """No pitch in project and files: one sentence with the number and the names, not one a scan."""
     for number in range(6):
         pixels = np.full((40, 40), 90 + number, np.uint8)
@@ -340,7 +331,7 @@ def test_scans_that_fail_alike_are_reported_once_and_all_scans_are_counted(tmp_p
     disks = '[targets]\nkind = "disk"\ndiameter_mm = 1.0\n[adjust]\ntransformation = "none"'
     project = f'camera = "camera.toml"\nscans = ["*.tif"]\n[object]\npoints = "points.csv"\n{disks}'
     points = ["point,X,Y,Z", "1,0,0,0", "2,9,0,0", "3,0,9,0", "4,9,9,1"]
-    write_tables(tmp_path, project, camera='name = "c"\nprincipal_distance_mm = 10.0', points=points)
+    projects.write_tables(tmp_path, project, camera='name = "c"\nprincipal_distance_mm = 10.0', points=points)
     message = refusal("measure", tmp_path / "project.toml")
     assert "reseau: 6 scans (s0, s1, s2, s3, s4, s5): pitch_um is missing in the project, and the file" in message
     assert message.count("reseau: ") == 1

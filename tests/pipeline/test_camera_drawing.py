@@ -129,7 +129,7 @@ def test_a_fit_finds_places_and_the_size_and_names_what_the_drawing_does_not_fit
         assert [bool(one.unfitted) for one in fitted.marks] == [False] * 4 + [True]
         assert fitted.marks[4].px == (200.0, 230.0)
         save_drawing(fitted, at_pitch(fitted), opened, tmp_path / "camera.toml")
-    text = (tmp_path / "camera.toml").read_text(encoding="utf-8")
+    text = (tmp_path / "camera.toml").read_text()
     assert "# The drawing did not fit at 5: as they were clicked.\n" in text
     moved = take_step(replace(fitted, point="5"), at_pitch(fitted), {"drag": "place", "px": [60.0, 60.0]}, opened)
     assert moved.marks[4].unfitted == ""
@@ -143,10 +143,10 @@ def test_a_saved_camera_measures(mark: dict[str, float | str], statuses: set[str
     drawing = CameraDrawing("a", mark, place_clicks(true_px()), "1", name="K", frame_mm=(17.0, 17.0))
     with open_scan(scan) as opened:
         camera = save_drawing(drawing, at_pitch(drawing), opened, tmp_path / "camera.toml")
-    text = (tmp_path / "camera.toml").read_text(encoding="utf-8")
+    text = (tmp_path / "camera.toml").read_text()
     assert "xy_mm of 1, 2, 3, 4: from their places in the scan and its pixel, not from a certificate" in text
     assert {one.sigma_mm for one in camera.fiducials} == {(1.0, 1.0)}
-    (tmp_path / "project.toml").write_text(PROJECT.replace("*.tif", str(scan)), encoding="utf-8")
+    (tmp_path / "project.toml").write_text(PROJECT.replace("*.tif", str(scan)))
     command("measure", tmp_path / "project.toml")
     assert {row["status"] for row in comparator(tmp_path).values()} <= statuses
     np.testing.assert_allclose(measured_px(tmp_path, "a"), true_px(), atol=0.1)
@@ -193,7 +193,7 @@ def test_a_camera_file_is_not_written_over_unless_it_was_drawn(scan: Path, tmp_p
 
 def test_a_project_whose_camera_is_missing_can_be_opened_to_draw_it(scan: Path, tmp_path: Path) -> None:
     project = tmp_path / "project.toml"
-    project.write_text(PROJECT.replace("*.tif", str(scan)).replace("camera.toml", "mine.toml"), encoding="utf-8")
+    project.write_text(PROJECT.replace("*.tif", str(scan)).replace("camera.toml", "mine.toml"))
     session = Session(read_undrawn(project), "ann")
     assert (session.camera_name, dict(session.project.cameras)) == ("mine.toml", {})
     alone = read_undrawn(tmp_path / "none.toml", [scan])
@@ -204,7 +204,7 @@ def test_a_project_whose_camera_is_missing_can_be_opened_to_draw_it(scan: Path, 
 def undrawn(scan: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str]]:
     """Folder of a project that has no camera yet, and the address where it is served."""
     folder = tmp_path_factory.mktemp("undrawn")
-    (folder / "project.toml").write_text(PROJECT.replace("*.tif", str(scan)), encoding="utf-8")
+    (folder / "project.toml").write_text(PROJECT.replace("*.tif", str(scan)))
     with served(folder / "project.toml") as server:
         yield folder, server.address
 
@@ -278,7 +278,7 @@ def learned_px(image: str) -> Array:
 def project(tmp_path: Path) -> Path:
     """What `measure` cannot learn by itself."""
     path = write_project(tmp_path / "p", "abc", PROJECT)
-    path.with_name("camera.toml").write_text(LEARNED, encoding="utf-8")
+    path.with_name("camera.toml").write_text(LEARNED)
     return path
 
 
@@ -332,7 +332,7 @@ def test_marks_of_one_scan_are_saved_as_a_camera_file(project: Path) -> None:
     pictures.close()
     assert "own.toml with 4 marks" in result["text"]
     assert 'name it in the project, camera = "own.toml"' in result["text"]
-    project.write_text(PROJECT.replace("camera.toml", "own.toml").replace("*.tif", "b.tif"), encoding="utf-8")
+    project.write_text(PROJECT.replace("camera.toml", "own.toml").replace("*.tif", "b.tif"))
     assert command("measure", project) == 0
     found = measured_px(project.parent, "b")
     np.testing.assert_allclose(found - learned_px("b"), np.broadcast_to(off, (4, 2)), atol=0.1)

@@ -10,7 +10,7 @@ import pytest
 from networks import LENSES, lens_network
 from projects import Array, Printed, Refusal, command, present, replace_text, result_file, write_network_project
 from studies import parametrize_with_studies
-from test_lens_comparison import two_networks
+from test_lens_families import two_networks
 
 from measure import FiducialOptions, FrameMeasurement, Status, measure_fiducials, open_scan
 from pipeline import InputError, read_adjustment, read_project
@@ -44,13 +44,13 @@ def rendered_frame(folder: Path, kind: str) -> tuple[CameraFile, dict[str, Array
     place, size = MARK_KINDS[kind].at[-1], (SIZE_MM, SIZE_MM)
     made = CameraSizes((kind,), size if place == "square" else None, size if place == "side" else None, None, 30.0)
     text = camera_template(made)
-    (folder / "open.toml").write_text(text, encoding="utf-8")
+    (folder / "open.toml").write_text(text)
     drawn = text.replace('polarity = "auto"', f'polarity = "{POLARITY.get(kind, "light")}"')
-    (folder / "camera.toml").write_text(drawn, encoding="utf-8")
+    (folder / "camera.toml").write_text(drawn)
     pad_mm = 0.0 if MARK_KINDS[kind].edge_mm is not None else 1.6
-    (folder / "scene.toml").write_text(SCENE.format(pad_mm=pad_mm), encoding="utf-8")
+    (folder / "scene.toml").write_text(SCENE.format(pad_mm=pad_mm))
     render_project(folder / "scene.toml", folder / "out", lambda *_: None)
-    truth = json.loads((folder / "out" / "truth.json").read_text(encoding="utf-8"))["images"]["one"]["fiducials"]
+    truth = json.loads((folder / "out" / "truth.json").read_text())["images"]["one"]["fiducials"]
     places = {id: np.array([mark["col_px"], mark["row_px"]]) for id, mark in truth.items()}
     return read_camera(folder / "open.toml"), places, next((folder / "out" / "scans").iterdir())
 
@@ -70,7 +70,7 @@ def test_a_wing_is_fitted_on_the_review_page_as_far_as_it_is_true(tmp_path: Path
     """Beyond the frame's edge it merges into the border. Clicked 3 px off."""
     given, places, path = rendered_frame(tmp_path, "wing")
     marks = tuple(ClickedMark(id, (float(px[0]) + 2.0, float(px[1]) - 2.0)) for id, px in places.items())
-    wing = tomllib.loads((tmp_path / "camera.toml").read_text(encoding="utf-8"))["mark"]["side"]
+    wing = tomllib.loads((tmp_path / "camera.toml").read_text())["mark"]["side"]
     drawn = {key: wing[key] for key in ("kind", "vertices_mm", "rotate")}
     drawing = CameraDrawing("one", drawn, marks, "5", frame_mm=given.frame_mm or (0.0, 0.0))
     with open_scan(path) as scan:
@@ -101,7 +101,7 @@ def test_what_makes_no_camera_is_stated(words: tuple[str, str | None, str | None
 
 def test_the_command_prints_a_file_that_loads(tmp_path: Path, printed: Printed, refusal: Refusal) -> None:
     (tmp_path / "camera.toml").write_text(
-        printed("template", "camera", "--marks", "ring-cross", "--square", "212", "--side", "226x220"), encoding="utf-8"
+        printed("template", "camera", "--marks", "ring-cross", "--square", "212", "--side", "226x220")
     )
     assert [one.xy_mm for one in read_camera(tmp_path / "camera.toml").fiducials][4:6] == [(-113.0, 0.0), (113.0, 0.0)]
     assert "--c go with `reseau template camera --marks KIND`" in refusal("template", "project", "--marks", "cross")
@@ -180,11 +180,11 @@ def test_a_lens_from_the_camera_file_to_the_report(name: str, tmp_path: Path) ->
     assert 0.8 < result["sigma0"] < 1.2
     for each, value in LENSES[name][1].items():
         assert abs(distortion[each]["value"] - value) < 4.0 * distortion[each]["sigma"], each
-    check = json.loads((tmp_path / "out" / "check.json").read_text(encoding="utf-8"))["cameras"]["L"]
+    check = json.loads((tmp_path / "out" / "check.json").read_text())["cameras"]["L"]
     # A skew is none of cv2.calibrateCamera's models; cv2.fisheye has one.
     assert check["verdict"] == ("agrees" if name == "opencv_fisheye" else "not possible"), check["reason"]
     assert ("OpenCV's model cannot take this lens" in check["reason"]) == (name != "opencv_fisheye")
-    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    page = (tmp_path / "out" / "report.html").read_text()
     assert ("refer to its axes, x right and y down" in page) == name.startswith("opencv")
     assert "Distortion over the radius with its 95 % band" in page
 

@@ -5,22 +5,9 @@ from dataclasses import replace
 from typing import Any
 
 import cv2
+import networks as nets
 import numpy as np
 import pytest
-from networks import (
-    CONVERGENT_STATIONS,
-    LENSES,
-    PROJECTED_C_MM,
-    PROJECTED_SIGMA_MM,
-    SIX_MARKS_MM,
-    X0_MM,
-    Y0_MM,
-    given_interior,
-    given_marks,
-    lens_network,
-    project_field,
-    relief_field,
-)
 from studies import parametrize_with_studies
 
 from adjust import Camera, Network, ObjectPoint, adjust, approximate
@@ -46,16 +33,16 @@ def simulated(
     film: bool = True,
     lens: Sequence[float] = MODERATE,
     aspect: float = 1.0,
-    noise_mm: float = PROJECTED_SIGMA_MM,
+    noise_mm: float = nets.PROJECTED_SIGMA_MM,
     distortion: Distortion = NO_DISTORTION,
 ) -> Network:
     """Frames of a test field through a known lens, with priors of 1 mm on the interior; marks all but fixed."""
     kind: Transformation = "affine" if film else "none"
-    network = project_field(
-        relief_field(relief_m, n=60), stations, kind=kind, noise_mm=noise_mm, distortion=lens, aspect=aspect
+    network = nets.project_field(
+        nets.relief_field(relief_m, n=60), stations, kind=kind, noise_mm=noise_mm, distortion=lens, aspect=aspect
     ).network
-    marks = given_marks(SIX_MARKS_MM, 0.001) if film else {}
-    camera = Camera("rc20", *given_interior((PROJECTED_C_MM + 0.3, 0.0, 0.0)), distortion, marks)
+    marks = nets.given_marks(nets.SIX_MARKS_MM, 0.001) if film else {}
+    camera = Camera("rc20", *nets.given_interior((nets.PROJECTED_C_MM + 0.3, 0.0, 0.0)), distortion, marks)
     return replace(network, cameras=(camera,))
 
 
@@ -82,7 +69,7 @@ def check_network(network: Network) -> CameraCheck:
 )
 @pytest.mark.parametrize("film", [True, False], ids=["film", "digital"])
 def test_a_moderate_lens_agrees_to_a_tenth_of_a_sigma(distortion: Distortion, aspect: float, film: bool) -> None:
-    check = check_network(simulated(CONVERGENT_STATIONS, film=film, distortion=distortion, aspect=aspect))
+    check = check_network(simulated(nets.CONVERGENT_STATIONS, film=film, distortion=distortion, aspect=aspect))
     assert check.verdict == "agrees", check.reason
     assert check.images == 5
     assert check.refit_residual_um < 0.02
@@ -97,7 +84,7 @@ def test_a_moderate_lens_agrees_to_a_tenth_of_a_sigma(distortion: Distortion, as
 @pytest.mark.parametrize("unit", [1e-6, 1e3])
 def test_the_unit_of_the_object_costs_opencv_no_digits(unit: float) -> None:
     """Objects of half a millimetre made its standard deviations wrong by factors of thousands."""
-    network = simulated(CONVERGENT_STATIONS, film=False, distortion=free("opencv", "k1", "k2", "p1", "p2", "k3"))
+    network = simulated(nets.CONVERGENT_STATIONS, film=False, distortion=free("opencv", "k1", "k2", "p1", "p2", "k3"))
     network = replace(network, cameras=tuple(replace(each, fiducials={}) for each in network.cameras))
     points = tuple(
         ObjectPoint(each.id, *(prior and Prior(unit * prior.value, prior.sigma) for prior in (each.X, each.Y, each.Z)))
@@ -117,9 +104,9 @@ def test_a_tilted_sensor_agrees(known: bool) -> None:
     priors = {name: Prior(value * known, 0.0 if known else FREE) for name, value in zip(TILT, tilt, strict=True)}
     given = free("opencv", "k1", "k2")
     distortion = replace(given, parameters={**given.parameters, **priors})
-    network = simulated(CONVERGENT_STATIONS, lens=lens, distortion=distortion)
+    network = simulated(nets.CONVERGENT_STATIONS, lens=lens, distortion=distortion)
     # A tilted sensor is all but another principal point.
-    held = replace(network.cameras[0], x0_mm=Prior(X0_MM), y0_mm=Prior(Y0_MM))
+    held = replace(network.cameras[0], x0_mm=Prior(nets.X0_MM), y0_mm=Prior(nets.Y0_MM))
     check = check_network(replace(network, cameras=(held,)))
     assert check.verdict == "agrees", check.reason
     assert [row.name for row in check.rows] == ["fx", "k1", "k2", *(() if known else TILT)]
@@ -139,7 +126,7 @@ def test_what_cannot_be_checked_is_reported_with_its_reason() -> None:
     assert "no counterpart of the distortion family gruen" in check_network(polynomials).reason
     one_fixed = replace(network.cameras[0], distortion=Distortion(), x0_mm=Prior(0.0))
     assert "both coordinates of the principal point" in check_network(replace(network, cameras=(one_fixed,))).reason
-    network = simulated(CONVERGENT_STATIONS, distortion=free("opencv", "k1", "k2"))
+    network = simulated(nets.CONVERGENT_STATIONS, distortion=free("opencv", "k1", "k2"))
     few = replace(network, observations=keeping(network.observations, {"f2": 5}))
     check = check_network(few)
     assert check.images == 4
@@ -151,7 +138,7 @@ def test_what_cannot_be_checked_is_reported_with_its_reason() -> None:
 
 
 def test_unknown_points_and_different_standard_deviations_are_reported() -> None:
-    network = simulated(CONVERGENT_STATIONS, distortion=FREE_LENS)
+    network = simulated(nets.CONVERGENT_STATIONS, distortion=FREE_LENS)
     points = tuple(
         ObjectPoint(p.id, None, None, None) if int(p.id[1:]) >= 30 and network.observations.point.count(p.id) > 1 else p
         for p in network.points
@@ -169,8 +156,8 @@ def test_unknown_points_and_different_standard_deviations_are_reported() -> None
 
 
 def test_a_prior_or_a_value_that_the_observations_contradict_differs() -> None:
-    network = simulated(CONVERGENT_STATIONS, distortion=FREE_LENS)
-    camera = replace(network.cameras[0], principal_distance_mm=Prior(PROJECTED_C_MM + 0.2, 0.002))
+    network = simulated(nets.CONVERGENT_STATIONS, distortion=FREE_LENS)
+    camera = replace(network.cameras[0], principal_distance_mm=Prior(nets.PROJECTED_C_MM + 0.2, 0.002))
     check = check_network(replace(network, cameras=(camera,)))
     assert check.verdict == "differs"
     assert "Priors or weights move c" in check.reason
@@ -183,7 +170,7 @@ def test_a_prior_or_a_value_that_the_observations_contradict_differs() -> None:
 @pytest.mark.parametrize("family", ["torlegard", "brown"])
 def test_a_strong_lens_agrees_by_way_of_the_same_model(family: str) -> None:
     names = {"torlegard": ("k3", "k5", "k7", "p1", "p2"), "brown": ("k1", "k2", "k3", "p1", "p2")}[family]
-    stations, lens = CONVERGENT_STATIONS * 4, free(family, *names)
+    stations, lens = nets.CONVERGENT_STATIONS * 4, free(family, *names)
     check = check_network(simulated(stations, film=False, lens=STRONG, noise_mm=0.002, distortion=lens))
     assert check.verdict == "agrees", check.reason
     assert check.reason.startswith("Given the very same model both programs agree.")
@@ -193,10 +180,14 @@ def test_a_strong_lens_agrees_by_way_of_the_same_model(family: str) -> None:
 @parametrize_with_studies("skew", [True, False], ids=["skew", "no skew"])
 def test_a_fisheye_agrees_with_opencvs_fisheye(skew: bool) -> None:
     """Which estimates both focal lengths or none: one of them free here is two for the comparison."""
-    network = lens_network("opencv_fisheye", np.random.default_rng(2))
+    network = nets.lens_network("opencv_fisheye", np.random.default_rng(2))
     if not skew:
         camera = network.cameras[0]
-        lens = {"k1": Prior(0.0, FREE), "k2": Prior(0.0, FREE), "b2": Prior(LENSES["opencv_fisheye"][1]["b2"], 0.0)}
+        lens = {
+            "k1": Prior(0.0, FREE),
+            "k2": Prior(0.0, FREE),
+            "b2": Prior(nets.LENSES["opencv_fisheye"][1]["b2"], 0.0),
+        }
         network = replace(network, cameras=(replace(camera, distortion=Distortion("opencv_fisheye", lens)),))
     check = check_against_opencv(adjust(network)).cameras["L"]
     names = ["fx", "fy", "cx", "cy", "k1", "k2", *(["alpha"] if skew else [])]
@@ -230,7 +221,7 @@ def test_another_solution_of_opencv_differs(monkeypatch: pytest.MonkeyPatch, wha
         return replace(found, parameters=found.parameters + 1.5 * found.sigmas)
 
     monkeypatch.setattr("pipeline.opencv_check.check.calibrate", shifted)
-    check = check_network(simulated(CONVERGENT_STATIONS, distortion=FREE_LENS))
+    check = check_network(simulated(nets.CONVERGENT_STATIONS, distortion=FREE_LENS))
     assert check.verdict == "differs"
     assert ("factor of 1.4" if what == "sigmas" else "by 1.5") in check.reason
 
@@ -247,7 +238,7 @@ def test_opencv_calibrates_in_one_thread(monkeypatch: pytest.MonkeyPatch) -> Non
     before = cv2.getNumThreads()
     cv2.setNumThreads(4)
     try:
-        check_network(simulated(CONVERGENT_STATIONS, distortion=FREE_LENS))
+        check_network(simulated(nets.CONVERGENT_STATIONS, distortion=FREE_LENS))
         assert (set(threads), cv2.getNumThreads()) == ({1}, 4)
     finally:
         cv2.setNumThreads(before)
@@ -278,7 +269,7 @@ def test_verdict_on_the_whole() -> None:
 
 def test_parameters_that_cannot_be_separated_are_not_compared_one_by_one() -> None:
     """A lens without a denominator, which is free: both programs have the same images, and other k1 to k6."""
-    network = lens_network("opencv", np.random.default_rng(3))
+    network = nets.lens_network("opencv", np.random.default_rng(3))
     middle = np.flatnonzero(np.linalg.norm(network.observations.xy_mm, axis=1) < 9.0)
     network = replace(network, observations=network.observations.only(middle))
     names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")

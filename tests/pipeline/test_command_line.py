@@ -41,8 +41,8 @@ from pipeline.text.wording import count_sentence
 
 def rewritten_scans(folder: Path, pattern: str) -> None:
     path = folder / "project.toml"
-    text = re.sub(r"^scans = .*$", f'scans = ["{pattern}"]', path.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    path.write_text(text, encoding="utf-8")
+    text = re.sub(r"^scans = .*$", f'scans = ["{pattern}"]', path.read_text(), flags=re.MULTILINE)
+    path.write_text(text)
 
 
 def results(folder: Path) -> dict[str, bytes]:
@@ -60,7 +60,7 @@ def remove(*names: str) -> Spoil:
 
 
 def write(name: str, text: str) -> Spoil:
-    return lambda folder: (folder / name).write_text(text, encoding="utf-8")
+    return lambda folder: (folder / name).write_text(text)
 
 
 def misspelt_key_and_no_file(folder: Path) -> None:
@@ -75,13 +75,13 @@ def name_in_another_encoding(folder: Path) -> None:
 
 
 def nothing_to_measure(folder: Path) -> None:
-    camera = (folder / "camera.toml").read_text(encoding="utf-8")
+    camera = (folder / "camera.toml").read_text()
     write("camera.toml", re.sub(r"^mark = .*$", 'mark = "none"', camera, flags=re.MULTILINE))(folder)
     write("project.toml", 'camera = "camera.toml"\nscans = ["scans/*.tif"]\n')(folder)
 
 
 def one_fiducial(folder: Path) -> None:
-    camera = (folder / "camera.toml").read_text(encoding="utf-8")
+    camera = (folder / "camera.toml").read_text()
     head, first, *_ = camera.split("[[fiducial]]")
     write("camera.toml", f"{head}[[fiducial]]{first}{camera[camera.index('[mark.') :]}")(folder)
 
@@ -176,17 +176,15 @@ def pixels_for_mm(rows: list[str]) -> list[str]:
         (pixels_for_mm, ["comparator.csv, line 2: the fiducials of image 'frame1' stand 22.4 times as far apart"]),
     ],
 )
-def test_what_the_coordinates_hold_is_adjusted_or_named(
-    project: Path, capsys: Capture, change: Callable[[list[str]], list[str]], words: list[str]
-) -> None:
+def test_marks(project: Path, capsys: Capture, change: Callable[[list[str]], list[str]], words: list[str]) -> None:
     """A point that nobody measured is a note: of a large pattern a part is used."""
     replace_text(project / "project.toml", "scans = [", "# scans = [")
     with (project / "points.csv").open("a", encoding="utf-8") as file:
         file.write("999,1,2,3,0,0,0,0,0,1\n")
-    lines = (project / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    lines = (project / "comparator.csv").read_text().splitlines()
     head = next(line for line in lines if line.startswith("image,"))
     rows = change([line for line in lines if line.startswith("frame")])
-    (project / "comparator.csv").write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")
+    (project / "comparator.csv").write_text("\n".join([head, *rows]) + "\n")
     capsys.readouterr()
     code = command("adjust", project / "project.toml", "--json")
     out, err = capsys.readouterr()
@@ -206,8 +204,8 @@ def test_an_interrupt_has_a_code_of_its_own(project: Path, capsys: Capture, monk
 
 def test_singular_network_is_named_in_words(project: Path, printed: Printed) -> None:
     path = project / "camera.toml"
-    text = path.read_text(encoding="utf-8").replace("sigma_mm = [0.005, 0.005]", 'sigma_mm = "free"')
-    path.write_text(re.sub(r"(?m)^(principal_\w+) = (1.0|\[1.0, 1.0\])$", r'\1 = "free"', text), encoding="utf-8")
+    text = path.read_text().replace("sigma_mm = [0.005, 0.005]", 'sigma_mm = "free"')
+    path.write_text(re.sub(r"(?m)^(principal_\w+) = (1.0|\[1.0, 1.0\])$", r'\1 = "free"', text))
     problems = json.loads(printed("adjust", project / "project.toml", "--json", code=1))["problems"]
     what = " ".join(problem["what"] for problem in problems)
     assert [word for word in ("Shift x", "Shift y", "Rotation", "Scale") if word not in what] == []

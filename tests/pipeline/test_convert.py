@@ -43,7 +43,7 @@ def test_the_help_lists_all_families() -> None:
 
 
 def test_a_camera_file_becomes_opencvs(tmp_path: Path, printed: Printed) -> None:
-    (tmp_path / "camera.toml").write_text(CAMERA, encoding="utf-8")
+    (tmp_path / "camera.toml").write_text(CAMERA)
     assert "opencv mean the same here" in printed("convert", tmp_path / "camera.toml", "opencv", tmp_path / "out")
     camera = read_camera(tmp_path / "out" / "camera.toml")
     s = 1.0 + 1.1e-4 * 13.488**2 - 1.5e-7 * 13.488**4
@@ -86,7 +86,7 @@ def test_the_larger_covariance_is_converted_saved_and_used(tmp_path: Path, print
     unlike = 1e-5 * np.random.default_rng(8).normal(size=len(network.images))[images, None]
     observed = replace(network.observations, xy_mm=xy_mm * (1.0 + unlike * (xy_mm**2).sum(axis=1, keepdims=True)))
     project = write_network_project(replace(network, observations=observed), tmp_path)
-    project.write_text(project.read_text(encoding="utf-8") + 'unmodelled = "estimate"\n', encoding="utf-8")
+    project.write_text(project.read_text() + 'unmodelled = "estimate"\n')
     command("adjust", project)
     first, out = tmp_path / "out" / "adjustment.json", tmp_path / "brown"
     known, names = read_covariance(first), ("c", "x0", "y0", "k1", "k2", "p1", "p2", "b1", "b2")
@@ -98,10 +98,8 @@ def test_the_larger_covariance_is_converted_saved_and_used(tmp_path: Path, print
     converted = read_covariance(out / "adjustment.json")
     np.testing.assert_allclose(np.sqrt(np.diag(converted.select_larger(keys))), sigmas, rtol=1e-6)
     (saved,) = save_cameras([read_project(project)], tmp_path / "saved")
-    text = (tmp_path / "camera.toml").read_text(encoding="utf-8")
-    (tmp_path / "later.toml").write_text(
-        text.replace("[sigma]\n", '[sigma]\ncalibration = "out/adjustment.json"\n'), encoding="utf-8"
-    )
+    text = (tmp_path / "camera.toml").read_text()
+    (tmp_path / "later.toml").write_text(text.replace("[sigma]\n", '[sigma]\ncalibration = "out/adjustment.json"\n'))
     for path in (saved.path, tmp_path / "later.toml"):
         calibration = present(read_camera(path).calibration)
         rows = [calibration.parameters.index(key) for key in keys]
@@ -110,7 +108,7 @@ def test_the_larger_covariance_is_converted_saved_and_used(tmp_path: Path, print
 
 def test_what_does_not_fit_is_reported(tmp_path: Path, printed: Printed, refusal: Refusal) -> None:
     camera = tmp_path / "camera.toml"
-    camera.write_text(CAMERA, encoding="utf-8")
+    camera.write_text(CAMERA)
     output = json.loads(printed("convert", camera, "brown", tmp_path / "out", "--json", code=LOOK))
     assert not output["same"]
     assert 0.5 < output["largest_um"] < 10.0
@@ -122,16 +120,16 @@ def test_what_does_not_fit_is_reported(tmp_path: Path, printed: Printed, refusal
         assert words in refusal(
             "convert", camera, arguments[0], tmp_path / arguments[1], *arguments[2:]
         ).lower().replace("\n", " ")
-    camera.write_text(CAMERA.replace("frame_mm = [36.0, 24.0]\n", ""), encoding="utf-8")
+    camera.write_text(CAMERA.replace("frame_mm = [36.0, 24.0]\n", ""))
     assert "has no frame_mm" in refusal("convert", camera, "opencv", tmp_path / "out")
     wide = CAMERA.split("[distortion]")[0].replace("28.8", "15.0")
     lens = '[distortion]\nfamily = "opencv_fisheye"\nvalue = {k1 = 0.03, k2 = -0.01, k3 = 0.002}\n'
-    (tmp_path / "wide.toml").write_text(wide + lens, encoding="utf-8")
+    (tmp_path / "wide.toml").write_text(wide + lens)
     assert "folds the image over" in refusal("convert", tmp_path / "wide.toml", "opencv", tmp_path / "wide")
     assert not (tmp_path / "wide").exists()
     project = tmp_path / "project.toml"
-    project.write_text('camera = "camera.toml"\n', encoding="utf-8")
-    (tmp_path / "comparator.csv").write_text("image,point,kind,x_mm,y_mm\na,1,target,1.0,1.0\n", encoding="utf-8")
+    project.write_text('camera = "camera.toml"\n')
+    (tmp_path / "comparator.csv").write_text("image,point,kind,x_mm,y_mm\na,1,target,1.0,1.0\n")
     message = refusal("convert", project, "opencv", tmp_path / "out")
     assert "is a project" in message
     assert str(camera) in message
@@ -147,7 +145,7 @@ def shift_parameter(project: Path, name: str, change_mm: float) -> Path:
     content = result_file(project)
     (camera,) = content["cameras"].values()
     camera["principal_distance_mm"]["value"] += change_mm
-    copy.write_text(json.dumps(content), encoding="utf-8")
+    copy.write_text(json.dumps(content))
     with np.load(project / "out" / "adjustment.npz") as arrays:
         whole = dict(arrays)
     whole["fingerprint"] = np.array(hash_file(copy))
@@ -171,7 +169,7 @@ def test_an_unchanged_camera_and_a_changed_one(project: Path, printed: Printed, 
     assert float(largest) < 0.2  # of their 0.3 um: c and the marks are hardly tied
     drawn = ElementTree.parse(out / "compare.svg").getroot()
     assert len(drawn.findall(f".//{SVG}ellipse")) == 49  # one a place of the field
-    content = json.loads((out / "compare.json").read_text(encoding="utf-8"))
+    content = json.loads((out / "compare.json").read_text())
     (difference,) = content["differences"]
     corner = np.array(difference["field_um"])[np.abs(content["places_mm"]).sum(axis=1).argmax()]
     assert content["verdict"] == "drift"

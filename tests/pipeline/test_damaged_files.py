@@ -39,11 +39,9 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows = ["image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg"]
     for i, (station, angles) in enumerate(zip(truth.stations, truth.attitudes, strict=True)):
         rows.append(",".join([f"f{i}", *(f"{value:.1f}" for value in (*station, *np.degrees(angles)))]))
-    (folder / "images.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    (folder / "images.csv").write_text("\n".join(rows) + "\n")
     one, other = ([getattr(network.point_by_id[id], axis).value for axis in "XYZ"] for id in "01")
-    (folder / "distances.csv").write_text(
-        f"from,to,distance,sigma\n0,1,{math.dist(one, other):.3f},0.01\n", encoding="utf-8"
-    )
+    (folder / "distances.csv").write_text(f"from,to,distance,sigma\n0,1,{math.dist(one, other):.3f},0.01\n")
     return folder
 
 
@@ -83,12 +81,10 @@ def test_damaged_tables_and_calibrations(trials: int, seed: int, sound: Path, tm
     ],
     ids=lambda value: value[:50],  # megabytes of names cost more than what they are the names of
 )  # fmt: skip
-def test_what_no_table_holds_is_refused(
-    sound: Path, tmp_path: Path, capsys: Capture, name: str, content: str, words: str
-) -> None:
+def test_no_table_holds_it(sound: Path, tmp_path: Path, capsys: Capture, name: str, content: str, words: str) -> None:
     project = copied(sound, tmp_path / "project")
     text = f'camera = "camera.toml"\n{content}\n' if name == "project.toml" else content
-    (project.parent / name).write_text(text, encoding="utf-8")
+    (project.parent / name).write_text(text)
     start = time.process_time()
     assert command("adjust", project) == 2
     assert time.process_time() - start < LONGEST_S / 2
@@ -189,9 +185,7 @@ def test_escape_sequences_in_names_do_not_reach_the_terminal(sound: Path, tmp_pa
     ("error", "words"),
     [(errno.EMFILE, "open files"), (errno.ENOSPC, "Make room"), (errno.EACCES, "permission"), (errno.EIO, "the drive")],
 )
-def test_what_the_machine_refuses_has_advice(
-    sound: Path, refusal: Refusal, monkeypatch: pytest.MonkeyPatch, error: int, words: str
-) -> None:
+def test_advice(sound: Path, refusal: Refusal, monkeypatch: pytest.MonkeyPatch, error: int, words: str) -> None:
     def refuse(*_: object) -> None:
         raise OSError(error, os.strerror(error), "here")
 
@@ -212,7 +206,7 @@ def test_what_the_machine_refuses_has_advice(
 def test_what_a_spreadsheet_would_run_is_written_as_text(cell: str, written: str, tmp_path: Path) -> None:
     assert csv_line([cell, "1"]) == f"{written},1"
     path = tmp_path / "table.csv"
-    path.write_text(f"name,value\n{csv_line([cell, '1'])}\n", encoding="utf-8")
+    path.write_text(f"name,value\n{csv_line([cell, '1'])}\n")
     assert next(read_csv(path, ("name", "value"))).name("name") == cell
 
 
@@ -348,11 +342,11 @@ def test_a_mistake_gets_one_message_at_once(
     """At once: it is sought in no observation."""
     monkeypatch.setattr("adjust.solution.adjustment.blunder_sentence", lambda *_: pytest.fail("sought a blunder"))
     project = copied(sound, tmp_path / "project")
-    text = (project.parent / file).read_text(encoding="utf-8")
+    text = (project.parent / file).read_text()
     for pattern, instead in changes.items():
         text, count = re.subn(pattern, instead, text)
         assert count, pattern
-    (project.parent / file).write_text(text, encoding="utf-8")
+    (project.parent / file).write_text(text)
     message = refusal("adjust", project)
     assert [word for word in words if word not in message] == [], message
     assert message.count("reseau: ") == 1

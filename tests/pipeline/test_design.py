@@ -58,7 +58,7 @@ def small(folder: Path, *changes: tuple[str, str]) -> Path:
         assert old in text
         text = text.replace(old, new, 1)
     path = folder / "small.toml"
-    path.write_text(text, encoding="utf-8")
+    path.write_text(text)
     return path
 
 
@@ -134,9 +134,7 @@ def test_the_network_is_what_the_frames_show(tmp_path: Path) -> None:
         ("design.sigma_fiducial_um", 45, lambda setup: setup.settings.sigma_fiducial_um),
     ],
 )
-def test_any_quantity_of_the_scene_can_be_varied(
-    tmp_path: Path, quantity: str, value: float, found: Callable[[object], float]
-) -> None:
+def test_quantities_vary(tmp_path: Path, quantity: str, value: float, found: Callable[[object], float]) -> None:
     varied = Variations.read(small(tmp_path)).varied(1, Sweep(quantity=quantity, values=(value, 99)), value)
     assert found(varied.setup()) == pytest.approx(value)
 
@@ -208,8 +206,8 @@ def test_a_distance_has_the_part_that_its_variance_gives_it(tmp_path: Path) -> N
     before = expect(Variations.read(small(tmp_path, ("sigma_height = 0.001", known))).setup())
     sigma = 0.0002
     table = f'[[design.distance]]\nfrom = "one"\nto = "two"\nsigma = {sigma}\n'
-    text = (tmp_path / "small.toml").read_text(encoding="utf-8")
-    (tmp_path / "base.toml").write_text(text + table, encoding="utf-8")
+    text = (tmp_path / "small.toml").read_text()
+    (tmp_path / "base.toml").write_text(text + table)
     after = expect(Variations.read(tmp_path / "base.toml").setup())
     names = list(before.plan.adjustment.names)
     cofactor = before.plan.adjustment.cofactor_of(names)
@@ -242,10 +240,10 @@ def test_observed_orientations_hold(tmp_path: Path) -> None:
 
 
 def test_frames_to_be_scanned_in_parts_are_planned_as_wholes(tmp_path: Path) -> None:
-    whole = small(tmp_path).read_text(encoding="utf-8")
+    whole = small(tmp_path).read_text()
     half = '[[image]]\nname = "two_b"\nposition = [2.0, 0.0, 4.6]\nangles_deg = [0.0, 23.0, 90.0]\n'
     parts = whole.replace('name = "two"\n', 'name = "two_a"\npart_of = "two"\npart = [0.0, 0.6]\n')
-    (tmp_path / "parts.toml").write_text(parts + half + 'part_of = "two"\npart = [0.4, 1.0]\n', encoding="utf-8")
+    (tmp_path / "parts.toml").write_text(parts + half + 'part_of = "two"\npart = [0.4, 1.0]\n')
     first, second = (expect(Variations.read(tmp_path / name).setup()) for name in ("small.toml", "parts.toml"))
     assert [image.name for image in second.network.images] == ["one", "two"]
     assert second.plan.sigma("IO.K.c") == pytest.approx(first.plan.sigma("IO.K.c"), rel=1e-9)

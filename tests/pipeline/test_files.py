@@ -55,7 +55,7 @@ OTHER = '[[fiducial]]\nid = "2"\n'
 
 def written(folder: Path, name: str, text: str) -> Path:
     path = folder / name
-    path.write_text(text, encoding="utf-8")
+    path.write_text(text)
     return path
 
 
@@ -270,14 +270,14 @@ def test_writing_is_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(InputError, match="No space left on device"):
         write_atomically(path, "later")
-    assert path.read_text(encoding="utf-8") == "earlier"
+    assert path.read_text() == "earlier"
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_trying_whether_a_folder_takes_results_touches_no_file_of_it(tmp_path: Path) -> None:
-    (tmp_path / "trial").write_text("the user's own", encoding="utf-8")
+    (tmp_path / "trial").write_text("the user's own")
     check_writable(tmp_path)
-    assert [path.read_text(encoding="utf-8") for path in tmp_path.iterdir()] == ["the user's own"]
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["the user's own"]
     with pytest.raises(InputError, match="trial: cannot be written"):
         check_writable(tmp_path / "trial")
 

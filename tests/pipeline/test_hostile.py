@@ -72,13 +72,13 @@ def test_all_changed_results(sound: Path, capsys: Capture) -> None:
     def trial(rng: random.Random) -> str:
         name, calls = rng.choice(sorted(commands(sound).items()))
         path, call = sound / name, rng.choice(calls)
-        whole = path.read_text(encoding="utf-8")
+        whole = path.read_text()
         text, what = change_json(whole, rng)
-        path.write_text(text, encoding="utf-8")
+        path.write_text(text)
         try:
             return command_ending(call, capsys, f"{call[:3:2]} with {name}: {what}")
         finally:
-            path.write_text(whole, encoding="utf-8")
+            path.write_text(whole)
 
     found = counted(3000, 2, trial)
     assert set(found) == {MESSAGE, RESULT}, "\n".join(found)
@@ -253,9 +253,7 @@ def test_a_changed_digest_is_never_taken_for_no_judging(measured_folder: Path, t
 
 @parametrize_with_studies(("trials", "seed"), [(4, 1), (600, 36)])
 @pytest.mark.parametrize("damage", [spoil_file, change_values])
-def test_a_damaged_results_database_gives_nothing_wrong(
-    trials: int, seed: int, damage: Damage, measured_folder: Path, tmp_path: Path
-) -> None:
+def test_damaged_databases(trials: int, seed: int, damage: Damage, measured_folder: Path, tmp_path: Path) -> None:
     right, folder = readings(measured_folder), tmp_path / "p"
 
     def trial(rng: random.Random) -> str:

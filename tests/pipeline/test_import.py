@@ -76,7 +76,7 @@ def test_fiducials_from_a_corner_give_no_principal_point(tmp_path: Path, capsys:
 
 def test_marks_without_a_sigma_need_one_that_is_stated(tmp_path: Path, refusal: Refusal) -> None:
     file = tmp_path / "MeasuresIm-a.tif.xml"
-    file.write_text(MARKS.format("10 20").replace("<NameIm>a<", "<NameIm>a.tif<"), encoding="utf-8")
+    file.write_text(MARKS.format("10 20").replace("<NameIm>a<", "<NameIm>a.tif<"))
     assert "say with --sigma-px" in refusal("import", "micmac", file, tmp_path / "o", *PITCH)
     assert "with --pitch-um" in refusal("import", "micmac", file, tmp_path / "o")
     folder = imported("micmac", [file], tmp_path, *PITCH, "--sigma-px", "0.2")
@@ -139,7 +139,7 @@ ENTITIES = '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]><a>&c
 )
 def test_wrong_files_are_refused(format: str, text: str, words: str, tmp_path: Path, capfd: Capture) -> None:
     file = tmp_path / "MeasuresIm-a.xml"
-    file.write_text(text, encoding="utf-8")
+    file.write_text(text)
     assert command("import", format, file, tmp_path / "o", *PITCH, "--sigma-px", "1") == WRONG_INPUT
     assert words in capfd.readouterr().err
     assert not (tmp_path / "o").exists()
@@ -147,7 +147,7 @@ def test_wrong_files_are_refused(format: str, text: str, words: str, tmp_path: P
 
 def test_a_fisheye_of_opencv_s_own_program_is_one(tmp_path: Path) -> None:
     """Its calibration program tells the model by a flag."""
-    (tmp_path / "fish.yml").write_text(PIXELS.format("fisheye_model: 1"), encoding="utf-8")
+    (tmp_path / "fish.yml").write_text(PIXELS.format("fisheye_model: 1"))
     camera = read_camera(imported("opencv", [tmp_path / "fish.yml"], tmp_path, *PITCH) / "camera.toml")
     assert camera.distortion.family == "opencv_fisheye"
 
@@ -182,7 +182,7 @@ def test_a_certificate_gives_back_the_lens_that_it_was_made_of_by_angles_and_rad
     np.testing.assert_allclose(fitted.residuals_um, 0.0, atol=1e-6)
     radii = [c * np.tan(np.radians(angle)) + um / 1000.0 for angle, um in zip(ANGLES, table, strict=True)]
     text = f"calibrated_principal_distance_mm = {c}\nradius_mm = {[float(r) for r in radii]}\nradial_um = {table}\n"
-    (tmp_path / "r.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "r.toml").write_text(text)
     by_radius = fit(read_certificate(tmp_path / "r.toml"))
     assert by_radius.equivalent_mm == pytest.approx(fitted.equivalent_mm, abs=1e-7)
     np.testing.assert_allclose(by_radius.coefficients, fitted.coefficients, rtol=1e-6, atol=1e-20)
@@ -264,6 +264,6 @@ def test_a_published_table_is_fitted_to_its_rounding(tmp_path: Path) -> None:
     camera = read_camera(folder / "camera.toml")
     assert camera.principal_distance_mm == pytest.approx(fitted.equivalent_mm)
     assert camera.distortion.family == "torlegard"
-    rows = list(csv.reader((folder / "osl-residuals.csv").read_text(encoding="utf-8").splitlines()[1:]))
+    rows = list(csv.reader((folder / "osl-residuals.csv").read_text().splitlines()[1:]))
     assert [float(row[2]) for row in rows[1:]] == [3.0, 4.0, 1.0, -3.0, -4.0, 3.0]
-    assert "calibrated 152.29" in (folder / "README.txt").read_text(encoding="utf-8")
+    assert "calibrated 152.29" in (folder / "README.txt").read_text()

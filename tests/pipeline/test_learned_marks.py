@@ -177,9 +177,7 @@ def test_cameras_named_alike_are_stored_apart(rendered: Path, tmp_path: Path, mo
             assert present(camera.learned_from).scan == image
 
 
-def test_marks_of_one_project_hold_nothing_of_another(
-    clicked_projects: tuple[Project, Project], rendered: Path, tmp_path: Path
-) -> None:
+def test_marks_are_of_one_project(clicked_projects: tuple[Project, Project], rendered: Path, tmp_path: Path) -> None:
     """There f1 is another scan than the one that they were clicked in."""
     for name, other in (("f1", "f0"), ("f2", "f2")):
         copy(rendered / "scans" / f"{other}.tif", tmp_path / f"{name}.tif")
@@ -249,9 +247,7 @@ SHOWN: dict[int, tuple[str, Callable[..., tuple[float, float]]]] = {
 
 
 @pytest.mark.parametrize(("tag", "pose"), [*((tag, "0") for tag in SHOWN), (3, "auto")])
-def test_clicks_in_a_picture_turned_by_any_orientation_tag_are_questioned(
-    tag: int, pose: str, rendered: Path, tmp_path: Path
-) -> None:
+def test_clicks_in_a_picture_turned_by_a_tag_are_doubted(tag: int, pose: str, rendered: Path, tmp_path: Path) -> None:
     picture = tifffile.imread(rendered / "scans" / "f1.tif")
     (tmp_path / "scans").mkdir()
     tifffile.imwrite(tmp_path / "scans" / "f1.tif", picture, extratags=[(274, 3, 1, tag, True)])

@@ -134,7 +134,7 @@ def write_images(folder: Path, images: int) -> Path:
 def stored(folder: Path) -> tuple[Path, list[MeasuredScan]]:
     """A project whose many scans were measured; of every tenth no target was seen."""
     project, scans = write_images(folder, 1), []
-    project.write_text('camera = "camera.toml"\nscans = ["scans/*.tif"]\npitch_um = 20.0\n', encoding="utf-8")
+    project.write_text('camera = "camera.toml"\nscans = ["scans/*.tif"]\npitch_um = 20.0\n')
     (folder / "scans").mkdir()
     for number in range(MOST_FRAMES + 11):
         file = folder / "scans" / f"{number:04d}.tif"
@@ -256,7 +256,7 @@ def test_a_report_and_a_frames_page_open_no_scan_unless_the_pictures_are_gone(fo
     page = folder / "out" / "frames" / "a.html"
     pictures = (folder / "out" / "thumbnails.db").rename(folder / "kept.db")
     assert command("report", folder / "project.toml", "--frames", "a") == 0
-    assert page.read_text(encoding="utf-8").count("data:image/png") == 4
+    assert page.read_text().count("data:image/png") == 4
     pictures.replace(folder / "out" / "thumbnails.db")
     for scan in folder.glob("*.tif"):  # the same size and time, and nothing in it
         stat = scan.stat()
@@ -265,8 +265,8 @@ def test_a_report_and_a_frames_page_open_no_scan_unless_the_pictures_are_gone(fo
     project = str(folder / "project.toml")
     assert command("report", project, "--frames", "a") == 0
     assert command("report", project) in (0, 1)
-    assert page.read_text(encoding="utf-8").count("data:image/png") == 4
-    assert (folder / "out" / "report.html").read_text(encoding="utf-8").count("data:image/png") == 12
+    assert page.read_text().count("data:image/png") == 4
+    assert (folder / "out" / "report.html").read_text().count("data:image/png") == 12
 
 
 def test_a_mark_that_was_measured_elsewhere_since_is_cut_anew(folder: Path) -> None:

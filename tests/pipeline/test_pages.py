@@ -44,8 +44,8 @@ def assert_demonstrated(folder: Path, frames: int) -> None:
         assert frame.observed["target"] >= 0.98 * frame.visible("target") - 1
     assert 0.85 < np.sqrt(np.mean(np.square([error for frame in found for error in frame.normalised]))) < 1.15
     assert np.abs(camera_errors(folder)).max() < 3.0
-    assert json.loads((folder / "out" / "check.json").read_text(encoding="utf-8"))["verdict"] == "agrees"
-    page = (folder / "out" / "report.html").read_text(encoding="utf-8")
+    assert json.loads((folder / "out" / "check.json").read_text())["verdict"] == "agrees"
+    page = (folder / "out" / "report.html").read_text()
     HTMLParser().feed(page)
     assert f"frame{frames}" in page
 
@@ -104,7 +104,7 @@ def test_the_demonstration_as_it_is_shown(browser: Browser, tmp_path: Path, caps
         assert_report_is_short(page, tmp_path / "demo")
 
 
-PAGE = (Path(__file__).parents[2] / "docs" / "start" / "film-scan.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "start" / "film-scan.md").read_text()
 
 
 def block(language: str) -> str:
@@ -114,7 +114,7 @@ def block(language: str) -> str:
 
 def test_the_tutorial_is_right(project: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     mine = project / "tutorial.toml"
-    mine.write_text(block("toml"), encoding="utf-8")
+    mine.write_text(block("toml"))
     read = read_project(mine)
     assert sorted(read.scans) == [path.stem for path in sorted((project / "scans").glob("*.tif"))]
     assert read.targets is not None
@@ -133,7 +133,7 @@ def test_the_example_measures_adjusts_and_plots(project: Path, tmp_path: Path, m
     mpl.use("Agg")
     project.rename(project.with_name("demo"))
     monkeypatch.chdir(project.parent)
-    page = (ROOT / "docs" / "how-to" / "python.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "how-to" / "python.md").read_text()
     _, code = re.findall(r"^```python\n(.*?)^```", page, flags=re.DOTALL | re.MULTILINE)
     made: dict[str, Any] = {}
     exec(compile(code, "python.md", "exec"), made)
@@ -157,7 +157,7 @@ PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 
 def commands(page: Path) -> Iterator[str]:
     """The lines of indented or fenced blocks that are commands of the program."""
-    text = page.read_text(encoding="utf-8")
+    text = page.read_text()
     blocks = re.findall(r"^```\w*\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
     for line in [*re.findall(r"^    (.*)$", text, flags=re.MULTILINE), *"".join(blocks).splitlines()]:
         if found := re.match(r"(?:\.venv/bin/|env/bin/)?reseau( .*)?$", line.strip()):
@@ -224,9 +224,9 @@ def test_the_commands_of_the_page_of_archives_run(desk: Path) -> None:
     with patch.object(server, "serve", lambda *_: None):
         codes = run_all(page, lambda command: "project.toml" in command or "--scan" in command)
         project = desk / "project.toml"
-        text = project.read_text(encoding="utf-8")
+        text = project.read_text()
         assert command("review", project) == DONE
-        project.write_text(text.replace('# camera = "camera.toml"', 'camera = "camera.toml"'), encoding="utf-8")
+        project.write_text(text.replace('# camera = "camera.toml"', 'camera = "camera.toml"'))
         codes |= run_all(page, lambda command: "project.toml" not in command)
     assert set(codes.values()) <= {DONE, LOOK}, codes
     assert (desk / "out" / "report.html").exists()
@@ -240,7 +240,7 @@ def test_the_figures_of_the_demonstration_on_the_pages(tmp_path: Path) -> None:
     shutil.copytree(tmp_path / "scans", mine / "scans")
     for name in ("camera.toml", "points.csv"):
         shutil.copy(tmp_path / name, mine)
-    (mine / "project.toml").write_text(block("toml"), encoding="utf-8")
+    (mine / "project.toml").write_text(block("toml"))
     assert command("run", mine / "project.toml") == DONE
     adjustment = read_adjustment(mine / "out" / "adjustment.json")
     (camera,) = adjustment.cameras.values()
@@ -260,15 +260,15 @@ def test_the_figures_of_the_demonstration_on_the_pages(tmp_path: Path) -> None:
 @real_data.needs("film_scans", "aerial")
 @pytest.mark.study
 def test_the_example_of_the_page_of_archives(tmp_path: Path, printed: Printed) -> None:
-    page = (ROOT / "docs" / "start" / "archive.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "start" / "archive.md").read_text()
     drawn = printed("template", "camera", "--marks", "ring-cross", "--square", "212", "--c", "153").split("[mark")[0]
     mark = present(re.search(r"^    \[mark.corner\]\n(?:    .*\n)+", page, flags=re.MULTILINE))
-    (tmp_path / "camera.toml").write_text(drawn + textwrap.dedent(mark[0]), encoding="utf-8")
+    (tmp_path / "camera.toml").write_text(drawn + textwrap.dedent(mark[0]))
     scan = real_data.DATA / "film_scans" / "aerial" / "0b50b18e.jpeg"
     project = f'camera = "camera.toml"\nscans = ["{scan}"]\n[measure]\ntone = "linear"\nwriting = "none"\n'
-    (tmp_path / "project.toml").write_text(project, encoding="utf-8")
+    (tmp_path / "project.toml").write_text(project)
     assert command("measure", tmp_path / "project.toml") == LOOK
-    rows = (tmp_path / "comparator.csv").read_text(encoding="utf-8").splitlines()
+    rows = (tmp_path / "comparator.csv").read_text().splitlines()
     shown = re.findall(r"^    (0b50b18e,.*)$", page, flags=re.MULTILINE)
     assert len(shown) == 2
     assert set(shown) <= set(rows)
@@ -290,11 +290,11 @@ def test_the_table_of_the_page_of_boards(tmp_path: Path, capsys: Capture) -> Non
         decimals = len(value.partition(".")[2])
         assert float(value.replace("−", "-")) == pytest.approx(found["value"], abs=0.51 * 10**-decimals)
         assert float(sigma) == pytest.approx(found["sigma"], abs=0.51 * 10**-decimals)
-    assert f"rms {camera['rms_px']:.3f} px a point" in page.read_text(encoding="utf-8")
-    assert f"rms {camera['lens_rms_px']['opencv4']:.3f} px in pictures left out" in page.read_text(encoding="utf-8")
+    assert f"rms {camera['rms_px']:.3f} px a point" in page.read_text()
+    assert f"rms {camera['lens_rms_px']['opencv4']:.3f} px in pictures left out" in page.read_text()
 
 
 def table(page: Path, first: str) -> list[list[str]]:
     """The cells of the table whose first column has this heading."""
-    lines = page.read_text(encoding="utf-8").split(f"| {first} |")[1].split("\n\n")[0].splitlines()[2:]
+    lines = page.read_text().split(f"| {first} |")[1].split("\n\n")[0].splitlines()[2:]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]

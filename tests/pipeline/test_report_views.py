@@ -19,7 +19,7 @@ from adjust.quality.lens_uncertainty import distortion_curves
 from measure.flags import NO_REASON, Status
 from pipeline import build_network, read_comparator, read_project
 from pipeline.drawing.svg import round_step, ticks
-from pipeline.report import Thumbnail
+from pipeline.report import Thumbnail, vectors
 from pipeline.report.data import Mark, natural
 from pipeline.report.fiducials import Figure, figure_of_films, figure_plot
 from pipeline.report.frame_views import SIZE_PX, mark_picture
@@ -28,16 +28,6 @@ from pipeline.report.load import report_data
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.parameters import high_correlations, parameter_rows
 from pipeline.report.plots import calibrated_cameras
-from pipeline.report.vectors import (
-    CELLS,
-    Plane,
-    VectorField,
-    all_images_plot,
-    contour_plot,
-    coverage_counts,
-    coverage_plot,
-    plane,
-)
 from pipeline.results.adjustment_file import Covariance
 from pipeline.results.adjustment_record import (
     CameraRecord,
@@ -131,12 +121,12 @@ def test_residuals_and_vectors_are_to_scale_and_y_points_up() -> None:
     assert (x1 - x0, y1 - y0) == pytest.approx((6.0, -8.0), abs=0.11)
     # A point at (50, 20) mm of a frame of 200 x 100 mm, moved by (10, -5) µm.
     row = replace(RESIDUAL, camera_x_mm=50.0, camera_y_mm=20.0, camera_vx_um=10.0, camera_vy_um=-5.0)
-    field = VectorField.from_residuals([row])
-    on = plane(field.places_mm, (200.0, 100.0), 560.0)
+    field = vectors.VectorField.from_residuals([row])
+    on = vectors.plane(field.places_mm, (200.0, 100.0), 560.0)
     assert on.height_px < on.width_px
     (x, y), (right, top) = on.page(np.array([(50.0, 20.0), (60.0, 30.0)]))
     assert (right - x, y - top) == pytest.approx((10.0 * on.px_per_mm, 10.0 * on.px_per_mm))
-    picture = all_images_plot(field, on, 4.0)
+    picture = vectors.all_images_plot(field, on, 4.0)
     stroke = re.search(r'<path d="([^"]+)" class="vector target"', picture)
     assert stroke
     x0, y0, x1, y1 = np.array(re.findall(r"-?\d+\.?\d*", stroke[1]), dtype=float)
@@ -144,32 +134,32 @@ def test_residuals_and_vectors_are_to_scale_and_y_points_up() -> None:
     assert field.scale(60.0) == 5.0
     # Its coordinates begin at the picture's corner, so that a frame about the origin would be half empty.
     places_mm = np.array([(1.0, -20.0), (31.0, -2.0)])
-    (left, low), (right, high) = plane(places_mm, (36.0, 24.0), 560.0).corners_mm
+    (left, low), (right, high) = vectors.plane(places_mm, (36.0, 24.0), 560.0).corners_mm
     assert (left, right, low, high) == pytest.approx((1.0, 31.0, -20.0, -2.0), abs=0.7)
 
 
-FRAME = Plane(np.array([[-60.0, -30.0], [60.0, 30.0]]), 652.0)  # 5 px per mm
+FRAME = vectors.Plane(np.array([[-60.0, -30.0], [60.0, 30.0]]), 652.0)  # 5 px per mm
 
 
 def test_coverage_is_counted_in_the_cell_of_each_observation() -> None:
     places_mm = np.array([[-59.0, -29.0], [-58.0, -21.0], [59.0, 29.0]])
-    counts, _, _ = coverage_counts(FRAME, places_mm)
-    assert counts.shape == (CELLS // 2, CELLS)
+    counts, _, _ = vectors.coverage_counts(FRAME, places_mm)
+    assert counts.shape == (vectors.CELLS // 2, vectors.CELLS)
     assert (counts[0, 0], counts[-1, -1], counts.sum()) == (2.0, 1.0, 3.0)
-    drawn = re.findall(r'<rect [^>]*class="covered"[^>]*>', coverage_plot(FRAME, places_mm))
+    drawn = re.findall(r'<rect [^>]*class="covered"[^>]*>', vectors.coverage_plot(FRAME, places_mm))
     assert ['x="26' in drawn[0], 'y="276' in drawn[0], len(drawn)] == [True, True, 2]  # the page's y points down
 
 
 def test_contours_of_a_field_that_grows_to_the_right_are_upright_lines_at_their_values() -> None:
     x_mm, y_mm = np.linspace(-60.0, 60.0, 25), np.linspace(-30.0, 30.0, 13)
     sigma_um = np.broadcast_to((x_mm + 60.0) / 12.0, (13, 25))  # 0 at the left edge, 10 at the right
-    plot = present(contour_plot(FRAME, x_mm, y_mm, sigma_um, "field"))
+    plot = present(vectors.contour_plot(FRAME, x_mm, y_mm, sigma_um, "field"))
     lines = re.findall(r'<path d="([^"]+)" class="contour"', plot)
     places = sorted(round(np.median([float(v) for v in re.findall(r"[\d.]+", line)[::2]]), 1) for line in lines)
     labels = sorted(float(text) for text in re.findall(r'class="contour-label"[^>]*>([\d.]+)<', plot))
     assert labels[-3:] == [1.0, 2.0, 5.0]
     assert [26.0 + 5.0 * 12.0 * value for value in labels] == pytest.approx(places, abs=0.2)
-    assert contour_plot(FRAME, x_mm, y_mm, np.zeros((13, 25)), "field") is None
+    assert vectors.contour_plot(FRAME, x_mm, y_mm, np.zeros((13, 25)), "field") is None
 
 
 Array = NDArray[np.float64]
@@ -189,7 +179,7 @@ def covariance(name: str, parameters: tuple[str, ...], matrix: Array) -> Covaria
     return Covariance(tuple(Parameter.interior(name, each) for each in parameters), np.zeros(len(parameters)), matrix)
 
 
-WIDE_FRAME = Plane(np.array([[-75.0, -75.0], [75.0, 75.0]]), 500.0)
+WIDE_FRAME = vectors.Plane(np.array([[-75.0, -75.0], [75.0, 75.0]]), 500.0)
 
 
 def third_degree_lens() -> Lens:
@@ -297,9 +287,7 @@ def test_they_show_what_the_adjustment_shows(adjusted_folder: Path) -> None:
         assert there_mm.shape == places_mm.shape
 
 
-def test_plots_that_cannot_be_made(
-    adjusted_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refusal: Refusal
-) -> None:
+def test_no_plots(adjusted_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refusal: Refusal) -> None:
     for name in ("camera.toml", "points.csv", "comparator.csv", "project.toml"):
         (tmp_path / name).write_bytes((adjusted_folder.parent / name).read_bytes())
     assert "no calibrated camera to plot." in refusal("report", tmp_path / "project.toml", "--plots", tmp_path / "p")

@@ -91,7 +91,7 @@ def test_an_adjustment_of_one_scan_less_is_not_shown(project: Path, capsys: Capt
     assert own_summary["sentence"].startswith("Measured: ")
     assert own_summary["adjustment"] is own_summary["check"] is None
     assert "adjustment.json is of other marks than there are now: it is not shown." in join_problems(own_summary)
-    assert "Calibrated" not in (project / "out" / "report.html").read_text(encoding="utf-8")
+    assert "Calibrated" not in (project / "out" / "report.html").read_text()
 
 
 def test_a_scan_that_is_not_measured_yet_is_named(project: Path, capsys: Capture) -> None:
@@ -140,16 +140,16 @@ def old_measurement(folder: Path) -> None:
 
 def drop_provenance(folder: Path) -> None:
     path = folder / "out" / "adjustment.json"
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = json.loads(path.read_text())
     del content["made_from"]
-    path.write_text(json.dumps(content), encoding="utf-8")
+    path.write_text(json.dumps(content))
 
 
 def shift_column(name: str, is_moved: Callable[[str], bool], column: int) -> Spoil:
     """A table of which one number, in the first of such rows, is another one."""
 
     def change(folder: Path) -> None:
-        line = next(filter(is_moved, (folder / name).read_text(encoding="utf-8").splitlines()))
+        line = next(filter(is_moved, (folder / name).read_text().splitlines()))
         cells = line.split(",")
         cells[column] = f"{float(cells[column]) + 0.01:.7f}"
         replace_text(folder / name, line, ",".join(cells))
@@ -194,7 +194,7 @@ def test_a_check_writes_nothing_but_its_own_file(project: Path, refusal: Refusal
     (project / "out" / "check.json").unlink()
     assert command("check", project / "project.toml") == 0
     assert states() == before
-    assert json.loads((project / "out" / "check.json").read_text(encoding="utf-8"))["verdict"] == "agrees"
+    assert json.loads((project / "out" / "check.json").read_text())["verdict"] == "agrees"
     surer_camera(project)
     assert "other cameras than there are now. Run `reseau adjust` first." in refusal("check", project / "project.toml")
     (project / "out" / "adjustment.json").unlink()
@@ -208,7 +208,7 @@ def test_files_that_say_the_same_in_other_letters_are_the_same(project: Path, tm
     shutil.move(project, moved)
     for name in ("points.csv", "camera.toml", "project.toml", "comparator.csv"):
         path = moved / name
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text().splitlines()
         if name == "points.csv":
             lines[1:] = reversed(lines[1:])
         path.write_bytes("\r\n".join([*lines, "# saved"]).encode())
@@ -276,11 +276,11 @@ def test_what_is_no_result_is_left_alone(project: Path, refusal: Refusal, name: 
     if name.endswith(".csv"):
         replace_text(project / "project.toml", 'comparator = "comparator.csv"', f'comparator = "{name}"')
     if content:
-        (project / name).write_text(content, encoding="utf-8")
+        (project / name).write_text(content)
     else:
         (project / name).symlink_to("/dev/null")
     assert words in refusal("run", project / "project.toml")
-    assert (project / name).read_text(encoding="utf-8") == content
+    assert (project / name).read_text() == content
 
 
 def test_a_refused_command_leaves_no_output_folder(project: Path, refusal: Refusal) -> None:
@@ -320,7 +320,7 @@ def test_what_an_ended_process_left_is_cleared(project: Path) -> None:
     host = os.uname().nodename
     left = project / "out" / f".unfinished.{host}.999999999"
     left.mkdir()
-    (left / "adjustment.json").write_text("half", encoding="utf-8")
+    (left / "adjustment.json").write_text("half")
     (project / f".comparator.unfinished.{host}.999999999.csv").touch()
     mine = project / "out" / f".unfinished.{host}.{os.getppid()}"
     mine.mkdir()
@@ -427,7 +427,7 @@ def test_two_hundred_kills(rendered_demo: Path, tmp_path: Path) -> None:
     replace_text(project, ', "scans/frame3.tif"', "")
     assert command("run", project) in (0, 1)
     replace_text(old / "camera.toml", "principal_distance_mm = 1.0", "principal_distance_mm = 0.5")
-    project.write_text(f"pitch_um = 45.001\n{project.read_text(encoding='utf-8')}", encoding="utf-8")  # other places
+    project.write_text(f"pitch_um = 45.001\n{project.read_text(encoding='utf-8')}")  # other places
     earlier, start = state(old), time.monotonic()
     _, complete, _ = ended(old, tmp_path / "trial", "run", signal.SIGKILL, LONGEST_S)
     seconds = time.monotonic() - start

@@ -27,18 +27,18 @@ from synthetic_images.render import render_scene
 from synthetic_images.scene import Film, Scene, SceneCamera, SceneFiducial, SceneImage, TakingLens, Tones
 from synthetic_images.scene import Scanner as SceneScanner
 
-TEMPLATE = (files("pipeline") / "templates" / "scene.toml").read_text(encoding="utf-8")
+TEMPLATE = (files("pipeline") / "templates" / "scene.toml").read_text()
 TRUTH = {"a20": 0.02, "b11": -0.015, "b02": 0.01}
 QUARTERS = [0.0, 90.0, 180.0, 270.0] * 2
 
 
 def project(folder: Path, network: Network, setting: str) -> Path:
     path = write_network_project(network, folder)
-    text = path.read_text(encoding="utf-8").replace('points = "points.csv"\n', 'images = "images.csv"\n')
-    path.write_text(f"{text}scanner = {setting}\n", encoding="utf-8")
+    text = path.read_text().replace('points = "points.csv"\n', 'images = "images.csv"\n')
+    path.write_text(f"{text}scanner = {setting}\n")
     names = [image.name for image in network.images]
     rows = [f"{name},{'' if i < len(names) // 2 else 'other'}" for i, name in enumerate(names)]
-    (folder / "images.csv").write_text("image,scanner\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    (folder / "images.csv").write_text("image,scanner\n" + "\n".join(rows) + "\n")
     return path
 
 
@@ -67,7 +67,7 @@ def test_two_scanners_of_images_csv_are_adjusted_and_shown(tmp_path: Path) -> No
     matrix = covariance.select([f"SC.1.{name}" for name in TRUTH])
     assert covariance_um2[0, 0, 0] == pytest.approx(1e6 * matrix[0, 0])
     assert covariance_um2[0, 1, 1] == pytest.approx(1e6 * matrix[1:, 1:].sum())
-    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    report = (tmp_path / "out" / "report.html").read_text()
     section = report[report.index('id="scanners"') : report.index('id="notes"')]
     assert section.count("<svg") == 2
     assert section.count('class="ellipse"') >= 2 * 72
@@ -103,9 +103,9 @@ def test_a_rendered_scanner_is_the_one_that_is_adjusted() -> None:
 
 def test_a_design_tries_scans_turned_by_180_degrees(tmp_path: Path) -> None:
     text = TEMPLATE.replace('scanner = "none"  ', 'scanner = ["a20", "b11"]  ').replace('pose = "90m"', 'pose = "0"')
-    (tmp_path / "scene.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "scene.toml").write_text(text)
     command("design", tmp_path / "scene.toml", tmp_path / "out")
-    found = json.loads((tmp_path / "out" / "design.json").read_text(encoding="utf-8"))
+    found = json.loads((tmp_path / "out" / "design.json").read_text())
     (turned,) = [one for one in found["what_would_help"] if one["change"] == "every second scan turned by 180 degrees"]
     rms_um = 1e3 * np.sqrt(np.mean([term["sigma"] ** 2 for term in found["scanners"]["1"].values()]))
     assert turned["sigmas"]["scanner"] < 0.99 * rms_um
@@ -149,7 +149,7 @@ def photograph(tmp_path_factory: pytest.TempPathFactory) -> Photograph:
     folder = tmp_path_factory.mktemp("photographed")
     made = photographed_scene(4.0, LENS)
     (frame,) = render_scene(made, folder).frames
-    (folder / "lens.yaml").write_text(taking_camera_yaml(made, LENS), encoding="utf-8")
+    (folder / "lens.yaml").write_text(taking_camera_yaml(made, LENS))
     return folder, {id: position.center_px for id, position in frame.fiducials.items()}
 
 
@@ -221,7 +221,7 @@ def test_the_covariance_of_a_calibration_is_that_of_ideal_places(tmp_path: Path)
 def test_an_unsure_lens_is_a_cause_of_covariances(photograph: Photograph) -> None:
     """Less what the film model takes: a shift and a scale of all marks are nobody's error."""
     folder, _ = photograph
-    text = (folder / "lens.yaml").read_text(encoding="utf-8")
+    text = (folder / "lens.yaml").read_text()
     storage = cv2.FileStorage(str(folder / "unsure.yaml"), cv2.FILE_STORAGE_WRITE)
     known = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     for name in ("image_width", "image_height"):
@@ -246,18 +246,17 @@ def test_a_scan_of_another_size_is_refused(photograph: Photograph, refusal: Refu
         assert not lens.misfit(scan)
         assert "Give the image uncropped" in replace(lens, size_px=(1000, 900)).misfit(scan)
     path = photographed_project(folder, "projective", '[scanner]\nlens = "small.yaml"\n')
-    text = (folder / "lens.yaml").read_text(encoding="utf-8")
-    (folder / "small.yaml").write_text(text.replace("image_width: 1534", "image_width: 1500"), encoding="utf-8")
+    text = (folder / "lens.yaml").read_text()
+    (folder / "small.yaml").write_text(text.replace("image_width: 1534", "image_width: 1500"))
     assert "calibrated for 1500 x 1534 px" in refusal("measure", path)
 
 
 def test_a_scene_with_a_taking_lens_gives_a_project_with_it(tmp_path: Path) -> None:
-    (tmp_path / "camera.toml").write_text(f"principal_distance_mm = 60.0\n{CAMERA}", encoding="utf-8")
+    (tmp_path / "camera.toml").write_text(f"principal_distance_mm = 60.0\n{CAMERA}")
     (tmp_path / "scene.toml").write_text(
         'camera = "camera.toml"\n[field]\nkind = "natural"\n[scan]\npitch_um = 100.0\nmargin_mm = 3.0\n'
         "[scan.lens]\nfocal_px = 600.0\nk1 = -0.1\n[[image]]\nname = 'a'\nposition = [0, 0, 3]\n"
-        "angles_deg = [0, 0, 0]\n",
-        encoding="utf-8",
+        "angles_deg = [0, 0, 0]\n"
     )
     assert command("render", tmp_path / "scene.toml", tmp_path / "out") == 0
     made = read_project(tmp_path / "out" / "project.toml")

@@ -21,7 +21,7 @@ from synthetic_images.frame import frame_truth
 from synthetic_images.scene import ChipMark, DrawnMark
 from synthetic_images.targets import field_targets
 
-TEMPLATE = resources.files("pipeline").joinpath("templates", "scene.toml").read_text(encoding="utf-8")
+TEMPLATE = resources.files("pipeline").joinpath("templates", "scene.toml").read_text()
 SCENES = Path(str(resources.files("synthetic_images").joinpath("scenes")))
 READY = sorted(path for path in SCENES.glob("*.toml") if not path.name.endswith("_camera.toml"))
 Rendered = tuple[Path, list[tuple[str, int, int]]]  # a folder, and the calls that told of progress
@@ -30,7 +30,7 @@ IMAGES = TEMPLATE.index("[[image]]")
 
 def written(folder: Path, text: str) -> Path:
     path = folder / "scene.toml"
-    path.write_text(text, encoding="utf-8")
+    path.write_text(text)
     return path
 
 
@@ -40,7 +40,7 @@ def changed(old: str, new: str, text: str = TEMPLATE) -> str:
 
 
 def rows(path: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+    return list(csv.DictReader(path.read_text().splitlines()))
 
 
 @parametrize_with_studies("path", READY, quick=(1, 5), ids=[path.stem for path in READY])
@@ -71,7 +71,7 @@ def test_the_template_becomes_a_project_and_its_truth(rendered_template: Rendere
         assert scan.width_px == 1356
     assert calls[-1] == ("frame2", 12, 12)
     assert [done for _, done, _ in calls] == list(range(1, 13))
-    truth = json.loads((rendered_template[0] / "truth.json").read_text(encoding="utf-8"))
+    truth = json.loads((rendered_template[0] / "truth.json").read_text())
     camera = truth["cameras"]["small metric camera"]
     assert camera["principal_distance_mm"] == {"value": 60.0}
     assert camera["distortion"]["k3"] == {"value": -6.0e-6}
@@ -93,7 +93,7 @@ def test_what_is_given_has_the_errors_that_the_scene_asks_for(tmp_path: Path) ->
     text = changed("# bend_um = {a20", "bend_um = {a20", text)
     scene_file = read_scene(written(tmp_path, text))
     write_project(scene_file, tmp_path)
-    assert 'scanner = "auto"' in (tmp_path / "project.toml").read_text(encoding="utf-8")
+    assert 'scanner = "auto"' in (tmp_path / "project.toml").read_text()
     given = read_camera(tmp_path / "camera.toml")
     assert given.principal_distance_mm != 60.0
     assert given.principal_distance_mm == pytest.approx(60.0, abs=5 * 0.2)
@@ -169,7 +169,7 @@ def test_boards_have_their_points(tmp_path: Path, field: str, board: ChessboardS
     write_project(scene_file, tmp_path)
     points = {target.id: tuple(target.center) for target in field_targets(scene_file.scene.field)}
     assert points == {id: pytest.approx(place) for id, place in board.object_points().items()}
-    targets = tomllib.loads((tmp_path / "project.toml").read_text(encoding="utf-8"))["targets"]
+    targets = tomllib.loads((tmp_path / "project.toml").read_text())["targets"]
     assert (targets["kind"], targets["columns"]) == (kind, 7)
 
 
@@ -199,7 +199,7 @@ def test_a_wrong_scene_file_says_what_is_wrong(tmp_path: Path, old: str, new: st
 
 
 def test_a_scene_that_cannot_be_rendered_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "camera.toml").write_text('name = "mine"', encoding="utf-8")
+    (tmp_path / "camera.toml").write_text('name = "mine"')
     path = written(tmp_path, TEMPLATE)
     with pytest.raises(InputError, match=r"holds camera.toml, which would be overwritten.*Name another folder"):
         render_project(path, tmp_path)

@@ -138,7 +138,7 @@ def test_a_step_to_a_later_version_is_made_whole_or_not_at_all(path: Path, monke
 
 def test_what_is_no_store_is_refused(path: Path, tmp_path: Path) -> None:
     path.parent.mkdir()
-    path.write_text("measured: nothing", encoding="utf-8")
+    path.write_text("measured: nothing")
     with pytest.raises(InputError, match="cannot be used as a database of measurements"):
         Store(path)
     path.unlink()
@@ -154,7 +154,7 @@ def test_what_is_no_store_is_refused(path: Path, tmp_path: Path) -> None:
         with pytest.raises(InputError, match=words):
             Store(path)
     Store(tmp_path / "a.db").close()
-    (tmp_path / "camera.toml").write_text("name = 1", encoding="utf-8")
+    (tmp_path / "camera.toml").write_text("name = 1")
     others = {"b.db": "there is no such results", "camera.toml": "is no results", "a.db": "joined into"}
     for name, words in others.items():
         with pytest.raises(InputError, match=words):
@@ -246,7 +246,7 @@ def test_keys_and_shards_depend_on_all_that_they_name() -> None:
 
 def test_the_identity_of_what_is_no_scan(tmp_path: Path) -> None:
     (tmp_path / "empty.tif").touch()
-    (tmp_path / "text.tif").write_text("no picture", encoding="utf-8")
+    (tmp_path / "text.tif").write_text("no picture")
     assert parts_hash(tmp_path / "none.tif") == content_hash(tmp_path / "none.tif") == ""
     assert parts_hash(tmp_path / "empty.tif") != parts_hash(tmp_path / "text.tif") != ""
     assert file_state(tmp_path / "none.tif", tmp_path).bytes == -1

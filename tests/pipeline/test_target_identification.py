@@ -125,7 +125,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """The folder of each field's picture. Tests copy it before they change anything."""
     folders = {field: tmp_path_factory.mktemp("scene") for field in (CROSSES, RINGS)}
     for field, folder in folders.items():
-        (folder / "scene.toml").write_text(SCENE.format(field=field), encoding="utf-8")
+        (folder / "scene.toml").write_text(SCENE.format(field=field))
         render_project(folder / "scene.toml", folder)
     return folders
 
@@ -134,9 +134,9 @@ def rendered(scene: Path, folder: Path) -> tuple[Path, dict[str, Array]]:
     """The project without its orientations, and the true places of the figures that are wholly seen."""
     shutil.copytree(scene, folder, dirs_exist_ok=True)
     project = folder / "project.toml"
-    lines = project.read_text(encoding="utf-8").splitlines()
-    project.write_text("\n".join(line for line in lines if not line.startswith("images")), encoding="utf-8")
-    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))["images"]["a"]["targets"]
+    lines = project.read_text().splitlines()
+    project.write_text("\n".join(line for line in lines if not line.startswith("images")))
+    truth = json.loads((folder / "truth.json").read_text())["images"]["a"]["targets"]
     places = {id: np.array([t["ellipse_col_px"], t["ellipse_row_px"]]) for id, t in truth.items() if t["visible"]}
     return project, places
 
@@ -150,8 +150,8 @@ def errors(scan: MeasuredScan, places: dict[str, Array]) -> dict[str, Array]:
 def test_crosses_in_space_with_no_principal_distance(scenes: dict[str, Path], tmp_path: Path) -> None:
     project, places = rendered(scenes[CROSSES], tmp_path)
     camera = tmp_path / "camera.toml"
-    lines = camera.read_text(encoding="utf-8").splitlines()
-    camera.write_text("\n".join(line for line in lines if "principal_distance" not in line), encoding="utf-8")
+    lines = camera.read_text().splitlines()
+    camera.write_text("\n".join(line for line in lines if "principal_distance" not in line))
     scan = measure_scan(read_project(project), "a")
     off = errors(scan, places)
     assert len(off) == len(places) > 12
@@ -162,9 +162,9 @@ def test_crosses_in_space_with_no_principal_distance(scenes: dict[str, Path], tm
 def test_an_orientation_that_does_not_fit_is_not_used(scenes: dict[str, Path], tmp_path: Path) -> None:
     project, places = rendered(scenes[CROSSES], tmp_path)
     turned = "image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg\na,-1.2,0.9,2.0,-25.0,-30.0,-90.0\n"
-    (tmp_path / "images.csv").write_text(turned, encoding="utf-8")
-    text = project.read_text(encoding="utf-8")
-    project.write_text(text.replace("[object]", '[object]\nimages = "images.csv"'), encoding="utf-8")
+    (tmp_path / "images.csv").write_text(turned)
+    text = project.read_text()
+    project.write_text(text.replace("[object]", '[object]\nimages = "images.csv"'))
     scan = measure_scan(read_project(project), "a")
     assert len(errors(scan, places)) == len(places)
     assert any("orientation in images.csv was not used" in problem for problem in scan.frame.problems)
@@ -179,8 +179,8 @@ def test_ring_codes_in_space_and_two_that_are_confused(scenes: dict[str, Path], 
     first, second = [id for id in places if int(id) < 4096][:2]
     points = tmp_path / "points.csv"
     swap = {first: second, second: first}
-    rows = [row.split(",", 1) for row in points.read_text(encoding="utf-8").splitlines()]
-    points.write_text("\n".join(f"{swap.get(id, id)},{rest}" for id, rest in rows), encoding="utf-8")
+    rows = [row.split(",", 1) for row in points.read_text().splitlines()]
+    points.write_text("\n".join(f"{swap.get(id, id)},{rest}" for id, rest in rows))
     scan = measure_scan(read_project(project), "a")
     assert any("lie where the field has another point" in problem for problem in scan.frame.problems)
     confused = errors(scan, places)
@@ -230,15 +230,15 @@ def test_a_code_of_no_point_of_the_sheet(scenes: dict[str, Path], tmp_path: Path
 
 def test_coordinates_in_another_unit_than_the_project_says(scenes: dict[str, Path], tmp_path: Path) -> None:
     project, _ = rendered(scenes[CROSSES], tmp_path)
-    text = project.read_text(encoding="utf-8")
-    project.write_text(text.replace('unit = "m"', 'unit = "mm"'), encoding="utf-8")
+    text = project.read_text()
+    project.write_text(text.replace('unit = "m"', 'unit = "mm"'))
     with pytest.raises(InputError, match=r"nine of ten points .* if their coordinates are in mm"):
         scan_tasks(read_project(project), ["a"])
-    project.write_text(text, encoding="utf-8")
+    project.write_text(text)
     points = tmp_path / "points.csv"
-    header, *rows = (row.split(",") for row in points.read_text(encoding="utf-8").splitlines())
+    header, *rows = (row.split(",") for row in points.read_text().splitlines())
     in_mm = [[row[0], *(f"{1000.0 * float(value):.3f}" for value in row[1:4]), *row[4:]] for row in rows]
-    points.write_text("\n".join(",".join(row) for row in (header, *in_mm)), encoding="utf-8")
+    points.write_text("\n".join(",".join(row) for row in (header, *in_mm)))
     scan = measure_scan(read_project(project), "a")
     assert any("unit the one of the coordinates?" in problem for problem in scan.frame.problems)
 
@@ -359,7 +359,7 @@ REAL_ROWS = """
 @pytest.mark.parametrize(("picture", "count"), [(21, 100), (26, 93)])
 def test_a_real_sheet(picture: int, count: int) -> None:
     """Every mark that was given for the picture gets its name, and its place to what a search without a fit can do."""
-    lines = (CAMCAL / "camcaldemo" / "measurements" / "markpts.txt").read_text(encoding="utf-8").splitlines()
+    lines = (CAMCAL / "camcaldemo" / "measurements" / "markpts.txt").read_text().splitlines()
     cells = [line.split(",") for line in lines if line.strip() and not line.startswith("#")]
     own = [row for row in cells if int(row[0]) == picture - 20]
     given = {int(row[1]): np.array([float(row[2]), float(row[3])]) - 0.5 for row in own}

@@ -7,24 +7,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+import projects
 import pytest
 import tifffile
 from networks import FIDUCIALS, affine, rotation
 from numpy.typing import NDArray
-from projects import (
-    IMAGES,
-    PITCH_MM,
-    POINTS,
-    TRUTH,
-    camera_mm,
-    command,
-    fiducial_tables,
-    ideal_mm,
-    present,
-    result_file,
-    scan_px,
-    write_tables,
-)
 from scipy.spatial.distance import pdist
 
 from adjust import ObjectPoint
@@ -36,21 +23,7 @@ from measure.tie_points.features import TieFrame
 from measure.tie_points.find_points import TieOptions, measure_ties
 from measure.tie_points.joins import measure_joins
 from pipeline import InputError, build_network, read_images, read_measurement, read_project
-from pipeline.blocks.block_stage import (
-    A_CELL,
-    CELLS,
-    BlockPicture,
-    BlockScan,
-    Mapped,
-    Sight,
-    camera_lattice,
-    camera_params,
-    feature_precision,
-    oriented_by_control,
-    tie_marks,
-    write_pictures,
-    written_block,
-)
+from pipeline.blocks import block_stage
 from pipeline.exchange.incoming import fiducial_camera
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.tie_stage import add_joins, check_tie_names
@@ -95,7 +68,7 @@ def test_natural_points_are_where_the_scene_says(tmp_path: Path) -> None:
             if mark.status is not Status.MEASURED or mark.quality["reference"]:
                 continue
             start = next(i for i in marks if name in marks[i] and marks[i][name].quality.get("reference"))
-            place = present(marks[start][name].center_px)
+            place = projects.present(marks[start][name].center_px)
             errors.append(np.asarray(mark.center_px) - transferred(place[None], geometry[start], geometry[image])[0])
             claimed.append(mark.quality["sigma_to_reference_px"])
     assert len(errors) > 41
@@ -122,7 +95,7 @@ ROWS = "image,point,kind,x_mm,y_mm\n" + "".join(
 
 def written(folder: Path, project: str = PROJECT) -> Path:
     points = ["point,X,Y,Z,sX,sY,sZ", "7,1.0,2.0,3.0,,,0.01", "8,5.0,2.0,3.0,,,0.01"]
-    return write_tables(folder, project, camera=CAMERA, points=points, comparator=ROWS)
+    return projects.write_tables(folder, project, camera=CAMERA, points=points, comparator=ROWS)
 
 
 def test_natural_points_have_the_ground_s_height_and_names_of_their_own(tmp_path: Path) -> None:
@@ -141,20 +114,25 @@ Array = NDArray[np.float64]
 BLOCK_CAMERA: CameraFile = replace(
     fiducial_camera("K", {id: np.array(xy) for id, xy in FIDUCIALS.items()}),
     frame_mm=(228.0, 228.0),
-    principal_distance_mm=TRUTH.c,
-    principal_point_mm=(TRUTH.x0, TRUTH.y0),
+    principal_distance_mm=projects.TRUTH.c,
+    principal_point_mm=(projects.TRUTH.x0, projects.TRUTH.y0),
     distortion=OtherDistortion(),
 )
-LATTICE = camera_lattice(BLOCK_CAMERA, PITCH_MM)
-PITCH_UM = (1000.0 * PITCH_MM, 1000.0 * PITCH_MM)
+LATTICE = block_stage.camera_lattice(BLOCK_CAMERA, projects.PITCH_MM)
+PITCH_UM = (1000.0 * projects.PITCH_MM, 1000.0 * projects.PITCH_MM)
 
 
 def chain(image: int) -> FrameChain:
-    return FrameChain(PITCH_UM, OtherFilm("affine", affine(TRUTH, image, "affine"), np.array(TRUTH.middle_mm)))
+    return FrameChain(
+        PITCH_UM, OtherFilm("affine", affine(projects.TRUTH, image, "affine"), np.array(projects.TRUTH.middle_mm))
+    )
 
 
 PICTURES = tuple(
-    BlockPicture(f"f{i}", "K", f"K/f{i}.png", LATTICE, (BlockScan(f"f{i}", chain(i), 2500, 2500),)) for i in IMAGES
+    block_stage.BlockPicture(
+        f"f{i}", "K", f"K/f{i}.png", LATTICE, (block_stage.BlockScan(f"f{i}", chain(i), 2500, 2500),)
+    )
+    for i in projects.IMAGES
 )
 SCALE, SHIFT = 0.01, np.array([3.0, -2.0, 5.0])
 TURN = rotation(0.4, -0.9, 2.0)
@@ -162,26 +140,27 @@ TURN = rotation(0.4, -0.9, 2.0)
 
 def lattice_px(places_mm: Array) -> Array:
     """Column and row of camera places in the pictures, counted from the frame's upper left pixel."""
-    return (places_mm - (-114.0, 114.0)) * (1.0, -1.0) / PITCH_MM
+    return (places_mm - (-114.0, 114.0)) * (1.0, -1.0) / projects.PITCH_MM
 
 
-def mapped(noise_px: float = 0.0) -> Mapped:
+def mapped(noise_px: float = 0.0) -> block_stage.Mapped:
     """What COLMAP would say of a perfect block, in a frame that is turned, shifted and of another scale."""
     rng = np.random.default_rng(5)
     poses = {}
-    for i in IMAGES:
-        turn = np.diag([1.0, -1.0, -1.0]) @ rotation(*TRUTH.attitudes[i]) @ TURN.T
-        station = SCALE * TURN @ np.array(TRUTH.stations[i]) + SHIFT
+    for i in projects.IMAGES:
+        turn = np.diag([1.0, -1.0, -1.0]) @ rotation(*projects.TRUTH.attitudes[i]) @ TURN.T
+        station = SCALE * TURN @ np.array(projects.TRUTH.stations[i]) + SHIFT
         poses[f"f{i}"] = (turn, -turn @ station)
-    view = [lattice_px(camera_mm(i)) + rng.normal(0.0, noise_px, (100, 2)) for i in IMAGES]
+    view = [lattice_px(projects.camera_mm(i)) + rng.normal(0.0, noise_px, (100, 2)) for i in projects.IMAGES]
     off = float(noise_px * np.sqrt(2.0 * (8 - 3) / 8))  # of eight coordinates three went into the point
     tracks = {
-        j: [Sight(f"f{i}", float(view[i][j, 0]), float(view[i][j, 1]), 4.0, off) for i in IMAGES] for j in range(100)
+        j: [block_stage.Sight(f"f{i}", float(view[i][j, 0]), float(view[i][j, 1]), 4.0, off) for i in projects.IMAGES]
+        for j in range(100)
     }
-    return Mapped(poses, tracks)
+    return block_stage.Mapped(poses, tracks)
 
 
-def disagree(block: Mapped, off_px: float) -> Mapped:
+def disagree(block: block_stage.Mapped, off_px: float) -> block_stage.Mapped:
     """The same places, but points that do not quite agree with them."""
     tracks = {j: [replace(sight, off_px=off_px) for sight in track] for j, track in block.tracks.items()}
     return replace(block, tracks=tracks)
@@ -192,35 +171,40 @@ def place_mm(point: ComparatorPoint) -> NDArray[np.float64]:
 
 
 def test_tracks_come_back_into_turned_mirrored_and_cut_scans() -> None:
-    marks = tie_marks(disagree(mapped(), 0.4), PICTURES)
+    marks = block_stage.tie_marks(disagree(mapped(), 0.4), PICTURES)
     assert {mark.image for mark in marks} == {"f0", "f1", "f2", "f3"}
     for mark in marks:
-        col, row = scan_px(int(mark.image[1:]), camera_mm(int(mark.image[1:])))[int(mark.point.removeprefix("tie-"))]
-        np.testing.assert_allclose(place_mm(mark), [col * PITCH_MM, -row * PITCH_MM], atol=1e-9)
+        col, row = projects.scan_px(int(mark.image[1:]), projects.camera_mm(int(mark.image[1:])))[
+            int(mark.point.removeprefix("tie-"))
+        ]
+        np.testing.assert_allclose(place_mm(mark), [col * projects.PITCH_MM, -row * projects.PITCH_MM], atol=1e-9)
         assert mark.kind == "tie"
     block = disagree(mapped(), 0.4)
-    marks = tie_marks(block, [half_picture(i) for i in IMAGES])
-    whole = {(mark.image, mark.point): mark for mark in tie_marks(block, PICTURES)}
+    marks = block_stage.tie_marks(block, [half_picture(i) for i in projects.IMAGES])
+    whole = {(mark.image, mark.point): mark for mark in block_stage.tie_marks(block, PICTURES)}
     assert len(marks) == len(whole)
-    assert {mark.image for mark in marks} == {f"f{i}{half}" for i in IMAGES for half in "lr"}
+    assert {mark.image for mark in marks} == {f"f{i}{half}" for i in projects.IMAGES for half in "lr"}
     for mark in marks:
         place = place_mm(whole[mark.image[:2], mark.point])
-        begin_mm = RIGHT_PX * PITCH_MM if mark.image.endswith("r") else 0.0
+        begin_mm = RIGHT_PX * projects.PITCH_MM if mark.image.endswith("r") else 0.0
         np.testing.assert_allclose(place_mm(mark), place - np.array([begin_mm, 0.0]), atol=1e-9)
-        col = place[0] / PITCH_MM
+        col = place[0] / projects.PITCH_MM
         assert col < LEFT_PX if mark.image.endswith("l") else col > RIGHT_PX
 
 
 LEFT_PX, RIGHT_PX = 1500, 1000  # the left scan of a frame ends at the one column, the right one begins at the other
 
 
-def half_picture(i: int) -> BlockPicture:
+def half_picture(i: int) -> block_stage.BlockPicture:
     """A frame whose scan was cut into two that overlap."""
-    a1, a2, a3, b1, b2, b3 = affine(TRUTH, i, "affine")
-    begin_mm = RIGHT_PX * PITCH_MM
+    a1, a2, a3, b1, b2, b3 = affine(projects.TRUTH, i, "affine")
+    begin_mm = RIGHT_PX * projects.PITCH_MM
     moved = np.array([a1 + a2 * begin_mm, a2, a3, b1 + b2 * begin_mm, b2, b3])
-    right = FrameChain(PITCH_UM, OtherFilm("affine", moved, np.array(TRUTH.middle_mm) - (begin_mm, 0.0)))
-    scans = (BlockScan(f"f{i}l", chain(i), LEFT_PX, 2500), BlockScan(f"f{i}r", right, 2500 - RIGHT_PX, 2500))
+    right = FrameChain(PITCH_UM, OtherFilm("affine", moved, np.array(projects.TRUTH.middle_mm) - (begin_mm, 0.0)))
+    scans = (
+        block_stage.BlockScan(f"f{i}l", chain(i), LEFT_PX, 2500),
+        block_stage.BlockScan(f"f{i}r", right, 2500 - RIGHT_PX, 2500),
+    )
     return replace(PICTURES[i], scans=scans)
 
 
@@ -236,71 +220,73 @@ def test_their_standard_deviation_is_that_of_features_of_their_size() -> None:
         noise = sigmas * rng.normal(size=2 * sights) * (30.0 if number % 30 == 0 else 1.0)
         left = noise - design @ (design.T @ noise)
         offs = np.hypot(*left.reshape(-1, 2).T)
-        tracks[number] = [Sight(f"f{i}", 1.0, 1.0, float(sizes[i]), float(offs[i])) for i in range(sights)]
-    precision = feature_precision(replace(mapped(), tracks=tracks))
+        tracks[number] = [block_stage.Sight(f"f{i}", 1.0, 1.0, float(sizes[i]), float(offs[i])) for i in range(sights)]
+    precision = block_stage.feature_precision(replace(mapped(), tracks=tracks))
     for size_px in (4.0, 7.0, 11.0):
         assert precision.sigma_px(size_px) == pytest.approx(np.hypot(0.5, 0.12 * size_px), rel=0.04)
     with pytest.raises(InputError, match="more overlap"):
-        feature_precision(replace(mapped(), tracks={1: tracks[1][:2]}))
+        block_stage.feature_precision(replace(mapped(), tracks={1: tracks[1][:2]}))
 
 
 def test_ties_are_spread_and_wrong_ones_left_out() -> None:
     block = mapped(0.5)
     crowded = {j: [replace(sight, col=1000.0 + j, row=1000.0) for sight in track] for j, track in block.tracks.items()}
-    assert len(tie_marks(replace(block, tracks=crowded), PICTURES)) == 4 * A_CELL
-    assert LATTICE.width_px / CELLS > 100
+    assert len(block_stage.tie_marks(replace(block, tracks=crowded), PICTURES)) == 4 * block_stage.A_CELL
+    assert LATTICE.width_px / block_stage.CELLS > 100
     wrong = {**block.tracks, 7: [replace(sight, off_px=4.0) for sight in block.tracks[7]]}
-    assert "tie-7" not in {mark.point for mark in tie_marks(replace(block, tracks=wrong), PICTURES)}
-    twice = {**block.tracks, 8: [*block.tracks[8], Sight("f0", 5.0, 5.0, 4.0, 0.5)]}
-    assert "tie-8" not in {mark.point for mark in tie_marks(replace(block, tracks=twice), PICTURES)}
+    assert "tie-7" not in {mark.point for mark in block_stage.tie_marks(replace(block, tracks=wrong), PICTURES)}
+    twice = {**block.tracks, 8: [*block.tracks[8], block_stage.Sight("f0", 5.0, 5.0, 4.0, 0.5)]}
+    assert "tie-8" not in {mark.point for mark in block_stage.tie_marks(replace(block, tracks=twice), PICTURES)}
 
 
 def control(count: int) -> tuple[list[ComparatorPoint], dict[str, ObjectPoint]]:
     """Control points marked in two images each, free of distortion: COLMAP's camera knows none here."""
     marks, points = [], {}
     for j in range(count):
-        points[str(j)] = ObjectPoint(str(j), *(Prior(float(value)) for value in POINTS[j]))
+        points[str(j)] = ObjectPoint(str(j), *(Prior(float(value)) for value in projects.POINTS[j]))
         for i in (0, 2):
-            px = scan_px(i, ideal_mm(i))[j] * (PITCH_MM, -PITCH_MM)
+            px = projects.scan_px(i, projects.ideal_mm(i))[j] * (projects.PITCH_MM, -projects.PITCH_MM)
             marks.append(ComparatorPoint(f"f{i}", str(j), "target", px, np.ones(2), 0.0, Status.MEASURED, ""))
     return marks, points
 
 
 def test_poses_come_into_the_frame_of_the_control() -> None:
-    rays = {f"f{i}": np.array([TRUTH.c, TRUTH.x0, TRUTH.y0]) for i in IMAGES}
-    placed = oriented_by_control(mapped(), PICTURES, *control(4), rays)
-    for i in IMAGES:
+    rays = {f"f{i}": np.array([projects.TRUTH.c, projects.TRUTH.x0, projects.TRUTH.y0]) for i in projects.IMAGES}
+    placed = block_stage.oriented_by_control(mapped(), PICTURES, *control(4), rays)
+    for i in projects.IMAGES:
         turn, station = placed[f"f{i}"]
-        np.testing.assert_allclose(turn, rotation(*TRUTH.attitudes[i]), atol=1e-9)
-        np.testing.assert_allclose(station, TRUTH.stations[i], atol=1e-6)
+        np.testing.assert_allclose(turn, rotation(*projects.TRUTH.attitudes[i]), atol=1e-9)
+        np.testing.assert_allclose(station, projects.TRUTH.stations[i], atol=1e-6)
     with pytest.raises(InputError, match="2 points with coordinates"):
-        oriented_by_control(mapped(), PICTURES, *control(2), rays)
+        block_stage.oriented_by_control(mapped(), PICTURES, *control(2), rays)
 
 
 def test_control_in_either_scan_of_a_frame_places_the_block(tmp_path: Path) -> None:
     """And what is written names the parts, so that the adjustment takes them for one frame."""
-    rays = {f"f{i}": np.array([TRUTH.c, TRUTH.x0, TRUTH.y0]) for i in IMAGES}
+    rays = {f"f{i}": np.array([projects.TRUTH.c, projects.TRUTH.x0, projects.TRUTH.y0]) for i in projects.IMAGES}
     marks, points = control(8)
     cut = []
     for mark in marks:
-        is_right = present(mark.xy_mm)[0] > 0.5 * (LEFT_PX + RIGHT_PX) * PITCH_MM
-        shift = np.array([RIGHT_PX * PITCH_MM, 0.0]) if is_right else np.zeros(2)
-        cut.append(replace(mark, image=f"{mark.image}{'r' if is_right else 'l'}", xy_mm=present(mark.xy_mm) - shift))
-    placed = oriented_by_control(mapped(), [half_picture(i) for i in IMAGES], cut, points, rays)
-    for i in IMAGES:
-        np.testing.assert_allclose(placed[f"f{i}"][1], TRUTH.stations[i], atol=1e-6)
-    images = ["image,part_of", *(f"f{i}{half},f{i}" for i in IMAGES for half in "lr")]
-    cut += [replace(cut[0], image=f"f{i}{half}", point="1", kind="fiducial") for i in IMAGES for half in "lr"]
+        is_right = projects.present(mark.xy_mm)[0] > 0.5 * (LEFT_PX + RIGHT_PX) * projects.PITCH_MM
+        shift = np.array([RIGHT_PX * projects.PITCH_MM, 0.0]) if is_right else np.zeros(2)
+        cut.append(
+            replace(mark, image=f"{mark.image}{'r' if is_right else 'l'}", xy_mm=projects.present(mark.xy_mm) - shift)
+        )
+    placed = block_stage.oriented_by_control(mapped(), [half_picture(i) for i in projects.IMAGES], cut, points, rays)
+    for i in projects.IMAGES:
+        np.testing.assert_allclose(placed[f"f{i}"][1], projects.TRUTH.stations[i], atol=1e-6)
+    images = ["image,part_of", *(f"f{i}{half},f{i}" for i in projects.IMAGES for half in "lr")]
+    cut += [replace(cut[0], image=f"f{i}{half}", point="1", kind="fiducial") for i in projects.IMAGES for half in "lr"]
     text = 'camera = "camera.toml"\n[object]\nimages = "images.csv"'
-    path = write_tables(tmp_path, text, camera='name = "K"', images=images)
+    path = projects.write_tables(tmp_path, text, camera='name = "K"', images=images)
     write_comparator(path.with_name("comparator.csv"), cut, {})
-    own = written_block(read_project(path), tmp_path / "block", cut, {"f1": placed["f1"]})
+    own = block_stage.written_block(read_project(path), tmp_path / "block", cut, {"f1": placed["f1"]})
     again = read_images(tmp_path / "block" / "images.csv")
-    assert again.part_of == {f"f{i}{half}": f"f{i}" for i in IMAGES for half in "lr"}
+    assert again.part_of == {f"f{i}{half}": f"f{i}" for i in projects.IMAGES for half in "lr"}
     assert own.scanned_frame("f2l") == "f2"
     for half in "lr":
-        exterior = present(again.exterior[f"f1{half}"])
-        np.testing.assert_allclose(exterior.values[:3], TRUTH.stations[1], atol=1e-6)
+        exterior = projects.present(again.exterior[f"f1{half}"])
+        np.testing.assert_allclose(exterior.values[:3], projects.TRUTH.stations[1], atol=1e-6)
         assert again.exterior[f"f0{half}"] is None
     assert {mark.image for mark in read_comparator(own.comparator) if mark.kind == "target"} <= {"f1l", "f1r"}
 
@@ -309,14 +295,14 @@ def test_control_in_either_scan_of_a_frame_places_the_block(tmp_path: Path) -> N
 def test_pictures_lie_where_the_lattice_says(tmp_path: Path) -> None:
     """A spot of light at a known place of the camera, in a mirrored scan, through resampling into the picture."""
     place = np.array([[31.37, -22.81]])
-    col, row = scan_px(2, place)[0]
+    col, row = projects.scan_px(2, place)[0]
     cols, rows = np.meshgrid(np.arange(2500.0), np.arange(2500.0))
     spot = 9000.0 * np.exp(-((cols - col) ** 2 + (rows - row) ** 2) / (2 * 2.5**2))
     tifffile.imwrite(tmp_path / "f2.tif", np.rint(4000.0 + 14.0 * cols + spot).astype(np.uint16), compression="deflate")
     scans = (FrameScan("f2", tmp_path / "f2.tif", chain(2)),)
-    task = ResampleTask("f2", "K", "0m", PITCH_MM, FAST, None, tmp_path / "frame.tif", scans)
+    task = ResampleTask("f2", "K", "0m", projects.PITCH_MM, FAST, None, tmp_path / "frame.tif", scans)
     assert resampled(task).problem == ""
-    (picture,) = write_pictures([task], {"K": BLOCK_CAMERA}, tmp_path)
+    (picture,) = block_stage.write_pictures([task], {"K": BLOCK_CAMERA}, tmp_path)
     image = np.asarray(cv2.imread(str(tmp_path / "pictures" / picture.name), cv2.IMREAD_UNCHANGED), dtype=float)
     mask = np.asarray(cv2.imread(str(tmp_path / "masks" / f"{picture.name}.png"), cv2.IMREAD_UNCHANGED))
     assert image.shape == mask.shape == (LATTICE.height_px, LATTICE.width_px)
@@ -336,9 +322,9 @@ def test_pictures_lie_where_the_lattice_says(tmp_path: Path) -> None:
 
 
 def test_the_camera_that_colmap_is_given_counts_from_the_corner() -> None:
-    fx, fy, cx, cy, *rest = camera_params(BLOCK_CAMERA, LATTICE)
-    assert fx == fy == pytest.approx(TRUTH.c / PITCH_MM)
-    assert (cx, cy) == pytest.approx(lattice_px(np.array([TRUTH.x0, TRUTH.y0])) + 0.5)
+    fx, fy, cx, cy, *rest = block_stage.camera_params(BLOCK_CAMERA, LATTICE)
+    assert fx == fy == pytest.approx(projects.TRUTH.c / projects.PITCH_MM)
+    assert (cx, cy) == pytest.approx(lattice_px(np.array([projects.TRUTH.x0, projects.TRUTH.y0])) + 0.5)
     assert rest == [0.0] * 4
 
 
@@ -350,7 +336,7 @@ principal_distance_mm = 60.0
 sigma = {principal_distance_mm = 0.1, principal_point_mm = 0.1}
 [camera.mark]
 m = {kind = "ring-cross", polarity = "light", ring_mm = 0.7, ring_line_mm = 0.14, arm_mm = 0.5, line_mm = 0.14}
-""" + fiducial_tables(
+""" + projects.fiducial_tables(
     {"1": (19, -19), "2": (-19, -19), "3": (-19, 19), "4": (19, 19)},
     'sigma_mm = 0.003\nmark = "m"\n',
     "camera.fiducial",
@@ -388,10 +374,10 @@ relief = 0.4
 def halves(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of the project, measured and adjusted."""
     folder = tmp_path_factory.mktemp("halves")
-    (folder / "scene.toml").write_text(HALVES_SCENE, encoding="utf-8")
-    assert command("render", folder / "scene.toml", folder) == 0
+    (folder / "scene.toml").write_text(HALVES_SCENE)
+    assert projects.command("render", folder / "scene.toml", folder) == 0
     for name in ("measure", "adjust", "report"):
-        assert command(name, folder / "project.toml") in (0, 1)
+        assert projects.command(name, folder / "project.toml") in (0, 1)
     return folder
 
 
@@ -404,8 +390,8 @@ def image_camera(image: dict[str, Any], pixels: np.ndarray) -> np.ndarray:
 
 @pytest.mark.study
 def test_one_adjustment_knows_both_films_one_orientation_and_all_marks_in_one_frame(halves: Path) -> None:
-    truth = json.loads((halves / "truth.json").read_text(encoding="utf-8"))["images"]
-    result = result_file(halves)
+    truth = json.loads((halves / "truth.json").read_text())["images"]
+    result = projects.result_file(halves)
     assert result["converged"]
     assert result["images"]["fa"]["exterior"] == result["images"]["fb"]["exterior"]
     assert result["groups"]["join"]["redundancy"] > 60.0

@@ -20,7 +20,7 @@ from pipeline.workers import LocalPool, SubmittedAgain, WorkerKilled, cluster_ex
 
 def count_up(told: Path) -> None:
     """What never lets go of the interpreter for long, nor comes to an end."""
-    told.write_text(str(os.getpid()), encoding="utf-8")
+    told.write_text(str(os.getpid()))
     number = 0
     while True:
         number += 1
@@ -29,7 +29,7 @@ def count_up(told: Path) -> None:
 def wait_for_a_pipe(told: Path) -> None:
     """What waits for the operating system."""
     os.mkfifo(pipe := told.with_suffix(".pipe"))
-    told.write_text(str(os.getpid()), encoding="utf-8")
+    told.write_text(str(os.getpid()))
     pipe.open("rb").read()
 
 
@@ -48,8 +48,8 @@ def test_a_worker_ends_with_the_process_that_started_it(kind: str, tmp_path: Pat
     program = f"from pathlib import Path; from test_workers import begin; begin({kind!r}, Path({str(result)!r}))"
     paths = os.pathsep.join(sys.path)
     parent = subprocess.Popen([sys.executable, "-c", program], env=os.environ | {"PYTHONPATH": paths})
-    assert wait_until(lambda: result.is_file() and result.read_text(encoding="utf-8") != "", 120.0)
-    worker = int(result.read_text(encoding="utf-8"))
+    assert wait_until(lambda: result.is_file() and result.read_text() != "", 120.0)
+    worker = int(result.read_text())
     assert is_alive(worker)
     time.sleep(0.3)
     parent.send_signal(signal.SIGKILL)
@@ -60,7 +60,7 @@ def test_a_worker_ends_with_the_process_that_started_it(kind: str, tmp_path: Pat
 def is_alive(pid: int) -> bool:
     """Whether a process is there and no zombie that its new parent has not asked after yet."""
     try:
-        state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except FileNotFoundError:
         return False
     return state != "Z"
@@ -105,8 +105,7 @@ def test_a_script_without_a_guard_starts_the_workers_once(tmp_path: Path) -> Non
     script = tmp_path / "script.py"
     script.write_text(
         "import operator\nfrom pipeline.workers import worker_pool\n"
-        "with worker_pool(1, workers=1) as pool:\n    print(pool.submit(operator.add, 2, 3).result(60))\n",
-        encoding="utf-8",
+        "with worker_pool(1, workers=1) as pool:\n    print(pool.submit(operator.add, 2, 3).result(60))\n"
     )
     variables = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run([sys.executable, str(script)], env=variables, capture_output=True, text=True)

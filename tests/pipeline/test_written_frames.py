@@ -55,7 +55,7 @@ def plated(camera: CameraFile, cameras: Mapping[str, CameraFile], **lines: Seque
 def test_frames_csv_has_every_line_with_what_it_says(tmp_path: Path) -> None:
     path = tmp_path / "out" / "frames.csv"
     assert write_frames(path, [scan("a", [line("RUN 7"), line("1/3/85"), line("Survey, Office")]), scan("b", None)])
-    rows = [row for row in path.read_text(encoding="utf-8").splitlines() if not row.startswith("#")]
+    rows = [row for row in path.read_text().splitlines() if not row.startswith("#")]
     assert rows == [
         "image,field,text,value,confidence,place,col_px,row_px",
         "a,run,RUN 7,7,0.90,top,30,25",
@@ -94,7 +94,7 @@ def test_a_camera_file_says_where_it_writes(tmp_path: Path) -> None:
     requests = ["left: reads upward", "right: plate reads downward", "top"]
     camera = parse_camera(Table({**CAMERA, "writing": requests, "number": "13182"}, tmp_path / "camera.toml", ""))
     assert camera.layout if camera.writing == (*WILD, WrittenPlace("top")) else None
-    camera.path.write_text(camera_text(camera, lambda name, _: name), encoding="utf-8")
+    camera.path.write_text(camera_text(camera, lambda name, _: name))
     assert read_camera(camera.path).writing == camera.writing
     assert read_camera(camera.path).number == "13182"
 
@@ -274,20 +274,19 @@ mark = {m = {kind = "ring-cross", ring_mm = 0.5, ring_line_mm = 0.1, arm_mm = 0.
 
 @pytest.mark.study
 def test_a_rendered_frame_is_read_and_its_pose_settled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "scene.toml").write_text(SCENE, encoding="utf-8")
+    (tmp_path / "scene.toml").write_text(SCENE)
     render_project(tmp_path / "scene.toml", tmp_path / "p")
     project = tmp_path / "p" / "project.toml"
     project.write_text(
-        'camera = "camera.toml"\nscans = ["scans/*.tif"]\npitch_um = 40.0\n[object]\nimages = "images.csv"\n',
-        encoding="utf-8",
+        'camera = "camera.toml"\nscans = ["scans/*.tif"]\npitch_um = 40.0\n[object]\nimages = "images.csv"\n'
     )
-    (tmp_path / "p" / "images.csv").write_text("image,run,date\na,,\n", encoding="utf-8")
+    (tmp_path / "p" / "images.csv").write_text("image,run,date\na,,\n")
     command("measure", project)
     (scan,) = read_measurement(tmp_path / "p" / "out" / "measurement.db")
     assert scan.frame.pose is not None
     assert (scan.frame.pose.name, scan.frame.pose.decided) == ("90m", True)
-    assert "a,run," in (tmp_path / "p" / "out" / "frames.csv").read_text(encoding="utf-8")
-    assert (tmp_path / "p" / "images.csv").read_text(encoding="utf-8") == "image,run,date\na,7,1968-05-16\n"
+    assert "a,run," in (tmp_path / "p" / "out" / "frames.csv").read_text()
+    assert (tmp_path / "p" / "images.csv").read_text() == "image,run,date\na,7,1968-05-16\n"
     monkeypatch.setattr("pipeline.measuring.scan_measurement.networks", lambda: None)
     monkeypatch.setattr("measure.fiducials.measurement.networks", lambda: None)
     command("measure", project)

@@ -36,7 +36,7 @@ class FrameComparison:
 
 def compare_frames(folder: Path) -> list[FrameComparison]:
     """The measured marks of a project with its truth.json: figures' centres, for a disk that of its ellipse."""
-    truth: Json = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+    truth: Json = json.loads((folder / "truth.json").read_text())
     frames = []
     for scan in read_measurement(folder / "out" / "measurement.db"):
         found = FrameComparison(truth["images"][scan.frame.image], scan.frame.pose.name if scan.frame.pose else "")
@@ -59,8 +59,8 @@ def compare_frames(folder: Path) -> list[FrameComparison]:
 
 def camera_errors(folder: Path) -> list[float]:
     """Errors over standard deviations of the adjusted quantities of the cameras that are estimated."""
-    truth: Json = json.loads((folder / "truth.json").read_text(encoding="utf-8"))["cameras"]
-    adjusted: Json = json.loads((folder / "out" / "adjustment.json").read_text(encoding="utf-8"))["cameras"]
+    truth: Json = json.loads((folder / "truth.json").read_text())["cameras"]
+    adjusted: Json = json.loads((folder / "out" / "adjustment.json").read_text())["cameras"]
     return [(mine["value"] - true["value"]) / mine["sigma"] for mine, true in _pairs(adjusted, truth) if mine["sigma"]]
 
 

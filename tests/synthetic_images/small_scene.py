@@ -8,59 +8,51 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
+from synthetic_images import scene as scenes
 from synthetic_images.areas import bar, ring
 from synthetic_images.render import render_scene
-from synthetic_images.scene import (
-    DiskField,
-    DiskTarget,
-    Distortion,
-    DrawnMark,
-    Film,
-    Scanner,
-    Scene,
-    SceneCamera,
-    SceneFiducial,
-    SceneImage,
-    Tones,
-)
 from synthetic_images.truth import Truth
 
 Array = NDArray[np.float64]
 
-CROSS = DrawnMark((ring((0.0, 0.0), 0.5, 0.1), bar((-0.4, 0.0), (0.4, 0.0), 0.1), bar((0.0, -0.4), (0.0, 0.4), 0.1)))
+CROSS = scenes.DrawnMark(
+    (ring((0.0, 0.0), 0.5, 0.1), bar((-0.4, 0.0), (0.4, 0.0), 0.1), bar((0.0, -0.4), (0.0, 0.4), 0.1))
+)
 PLACES = {"a": (4.0, -4.1), "b": (-4.2, -4.0), "c": (-4.0, 4.3), "d": (3.9, 3.8)}
-CAMERA = SceneCamera(
+CAMERA = scenes.SceneCamera(
     "small",
     (12.0, 12.0),
     14.0,
     (0.05, -0.04),
-    Distortion("torlegard", {"k3": -2.0e-4, "p1": 3.0e-5}),
-    tuple(SceneFiducial(id, xy, CROSS) for id, xy in PLACES.items()),
+    scenes.Distortion("torlegard", {"k3": -2.0e-4, "p1": 3.0e-5}),
+    tuple(scenes.SceneFiducial(id, xy, CROSS) for id, xy in PLACES.items()),
 )
-FIELD = DiskField(
+FIELD = scenes.DiskField(
     tuple(
-        DiskTarget(f"{10 * i + j}", (0.55 * i, 0.55 * j, 0.1 * ((i + j) % 3)), (0.1, 0.05, 1.0))
+        scenes.DiskTarget(f"{10 * i + j}", (0.55 * i, 0.55 * j, 0.1 * ((i + j) % 3)), (0.1, 0.05, 1.0))
         for i in (-1, 0, 1)
         for j in (-1, 0, 1)
     ),
     0.12,
     surround=0.0,
 )
-OBLIQUE = SceneImage("f", (1.2, -0.5, 3.2, 0.16, 0.34, 0.4))
-SCANNER = Scanner((40.0, 40.0), margin_mm=1.0)
+OBLIQUE = scenes.SceneImage("f", (1.2, -0.5, 3.2, 0.16, 0.34, 0.4))
+SCANNER = scenes.Scanner((40.0, 40.0), margin_mm=1.0)
 
 
-def scene(**changes: Any) -> Scene:
-    plain = Scene("test", 4, CAMERA, FIELD, (OBLIQUE,), SCANNER, Film(), Tones(contrast=0.0), pad_mm=1.2)
+def scene(**changes: Any) -> scenes.Scene:
+    plain = scenes.Scene(
+        "test", 4, CAMERA, FIELD, (OBLIQUE,), SCANNER, scenes.Film(), scenes.Tones(contrast=0.0), pad_mm=1.2
+    )
     return replace(plain, **changes)
 
 
-def rendered(folder: Path, made: Scene) -> tuple[Array, Truth]:
+def rendered(folder: Path, made: scenes.Scene) -> tuple[Array, Truth]:
     """The first scan's grey values as shares of full scale, and the truth."""
     truth = render_scene(made, folder)
     grey = tifffile.imread(folder / "scans" / f"{made.images[0].name}.tif")
     return np.asarray(grey, np.float64) / np.iinfo(grey.dtype).max, truth
 
 
-def hidden_field() -> DiskField:
-    return DiskField((DiskTarget("1", (0.0, 0.0, 50.0)),), 0.1)
+def hidden_field() -> scenes.DiskField:
+    return scenes.DiskField((scenes.DiskTarget("1", (0.0, 0.0, 50.0)),), 0.1)

@@ -30,7 +30,7 @@ def stored_plainly(tmp_path_factory: pytest.TempPathFactory) -> dict[bool, Grey]
 @pytest.mark.parametrize("compression", ["none", "lzw", "deflate", "zstd"])
 @pytest.mark.parametrize("tile_px", [0, 64, 384])
 @pytest.mark.parametrize("colour", [False, True])
-def test_files_hold_the_same_picture(
+def test_the_same_picture(
     tmp_path: Path, stored_plainly: dict[bool, Grey], compression: Compression, tile_px: int, colour: bool
 ) -> None:
     scanner = replace(SCANNER, colour=colour, noise=0.01, compression=compression, tile_px=tile_px)
