@@ -235,18 +235,18 @@ def study() -> Iterable[tuple[str, str, list[tuple[str, Plan]]]]:
     )
     yield (
         "convergence",
-        "Tilt of the outer four photographs, flat known field",
+        "Tilt of the outer four photographs over a flat known field, degrees",
         [(f"{t}", replace(base, tilt_deg=float(t))) for t in (0, 2, 5, 10, 20, 30, 40)],
     )
     yield "points", "Number of points", [(f"{n}", replace(base, points=n)) for n in (12, 25, 50, 100, 200)]
     yield (
         "control",
-        "Standard deviation of the given coordinates, um at image scale",
+        "Standard deviation of the given coordinates, µm at image scale",
         [(f"{s:g}", replace(base, point_um=s)) for s in (0.0, 2.0, 5.0, 10.0, 20.0, 50.0)],
     )
     yield (
         "fiducial-sigma",
-        "Standard deviation of the measured fiducials, um",
+        "Standard deviation of the measured fiducials, µm",
         [(f"{s:g}", replace(base, fiducial_um=s)) for s in (1.0, 3.0, 5.0, 9.0)],
     )
 
@@ -278,10 +278,11 @@ def _cell(cell: str | float) -> str:
 
 
 def draw_study(path: Path, title: str, rows: list[tuple[str, list[float]]]) -> None:
-    """Plot the standard deviations over the quantity of a table."""
-    places = np.arange(len(rows))
+    """Plot the standard deviations over the quantity of a table: logarithms on both axes, 0 a step below the least."""
+    places = np.array([float(words) for words, _ in rows])
     axes = _draw(places, {head: [values[k] for _, values in rows] for k, head in enumerate(HEADS)})
     axes.set(yscale="log", xlabel=title)
+    axes.set_xscale("symlog", linthresh=places[places > 0.0].min(), linscale=0.3)
     axes.yaxis.set_major_formatter("{x:g}")
     axes.set_xticks(places, [words for words, _ in rows])
     _save(path, axes)
@@ -329,8 +330,9 @@ def _draw_points(path: Path, swept: Swept) -> None:
     counts = np.array([float(step.value) for step in swept.steps])
     axes = _draw(counts, {name: [step.sigmas.mean[name] for step in swept.steps] for name in PAPER_UM})
     first = swept.steps[0].sigmas.mean["t1"]
-    for slope, style in ((-0.5, ":"), (-0.62, "--")):
-        axes.plot(counts, 1.8 * first * (counts / counts[0]) ** slope, style, color="0.5", label=f"slope {slope}")
+    for slope, style, whose in ((-0.5, ":", "uncorrelated points"), (-0.62, "--", "printed by Juhl")):
+        line = 1.8 * first * (counts / counts[0]) ** slope
+        axes.plot(counts, line, style, color="0.5", label=f"slope {slope}, {whose}")
     axes.set(xscale="log", yscale="log", xlabel="number of points")
     for axis, places in ((axes.xaxis, counts), (axes.yaxis, np.array([0.3, 0.5, 1.0, 2.0, 3.0]))):
         axis.set_ticks(places, [f"{place:g}" for place in places])

@@ -5,7 +5,6 @@ words are the program's.
 """
 
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -20,14 +19,13 @@ from faults import AXES, CATALOGUE, MISHAPS, Failure, Mishap, sentences
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.problem.estimates import NullDirection
 from adjust.problem.network import Network
-from adjust.problem.parameter import Parameter, description
 from adjust.solution.adjustment import adjust
 
 Array = NDArray[np.float64]
 
 REPEATED = 3  # sentences of one kind that are printed, of many
 COLUMNS = 3
-TITLE_WIDTH = 36  # characters
+TITLE_WIDTH = 42  # characters
 OBLIQUE = np.array([[1.0, 0.45, 0.0], [0.0, 0.3, 1.0]])  # object to paper
 AXIS, ARROW = 600.0, 260.0  # drawn lengths of a camera's axis and of its x', in m
 
@@ -42,8 +40,8 @@ direction, a change of the network ends those that it is advised for.
 
 Every network is simulated without errors. There are four images (or as many as are said) from 1500 m by a camera of
 c = 153 mm with five fiducial marks, film transformations are affine, and nothing is given of fiducials, c, x0', y0'
-(F5 to F9 are dropped). The datum has minimum constraints where too little of the object is known. What moves
-together stands in parentheses. [The theory](method/theory.md) says why the directions are there.
+(F5 to F9 are dropped). The datum has minimum constraints where too little of the object is known. A remedy is printed
+once, where it comes first. Tilts are ω and φ. [The theory](method/theory.md) says why the directions are there.
 
 ![The networks](failure-gallery.png)
 
@@ -66,10 +64,10 @@ def main() -> None:
 
 def text() -> str:
     """The whole page."""
-    parts = [INTRODUCTION]
-    parts += [_direction(each) for each in _null(CATALOGUE["known-relief"])]
+    parts, remedies = [INTRODUCTION], dict[str, int]()
+    parts += [_direction(each, 0, remedies) for each in _null(CATALOGUE["known-relief"])]
     parts.append("\n## What networks add\n\nOnly what is more than the four above.\n")
-    parts += [_failure(number, failure) for number, failure in enumerate(CATALOGUE.values(), 1)]
+    parts += [_failure(number, failure, remedies) for number, failure in enumerate(CATALOGUE.values(), 1)]
     parts.append("\n## Other mishaps\n\nPriors of 1 mm, unless it says otherwise; observations with errors.\n")
     parts += [_mishap(mishap) for mishap in MISHAPS.values()]
     return "".join(parts)
@@ -79,21 +77,17 @@ def _null(failure: Failure) -> tuple[NullDirection, ...]:
     return adjust(*failure.setup.network(), failure.options).singular
 
 
-def _failure(number: int, failure: Failure) -> str:
+def _failure(number: int, failure: Failure, remedies: dict[str, int]) -> str:
     found = _null(failure)
     more = [each for each in found if not each.cause.startswith(AXES)]
     lines = f"\n### {number}. {failure.title}\n\nDefect {len(found)}: 4 + {len(more)}.\n"
-    return lines + "".join(_direction(each) for each in more)
+    return lines + "".join(_direction(each, number, remedies) for each in more)
 
 
-def _direction(each: NullDirection) -> str:
-    return f"\n- {each.cause} *{each.remedy}* ({_moving(each.parameters)})\n"
-
-
-def _moving(parameters: Sequence[Parameter]) -> str:
-    """What moves, the films as one: which of their parameters lead, rounding decides."""
-    films = ["film transformations"] if any(each.kind == "film" for each in parameters) else []
-    return "; ".join([*filter(None, [description(each for each in parameters if each.kind != "film")]), *films])
+def _direction(each: NullDirection, number: int, remedies: dict[str, int]) -> str:
+    """Cause and remedy. remedies: those printed so far, with the network that they stand at; completed here."""
+    first = remedies.setdefault(each.remedy, number)
+    return f"\n- {each.cause} *{each.remedy if first == number else f'Remedy: as in {first}.'}*\n"
 
 
 def _mishap(mishap: Mishap) -> str:
@@ -113,7 +107,8 @@ def draw(path: Path) -> None:
     from matplotlib import pyplot
 
     rows = -(-len(CATALOGUE) // COLUMNS)
-    figure, panels = pyplot.subplots(rows, COLUMNS, figsize=(9.0, 2.5 * rows), layout="constrained")
+    figure, panels = pyplot.subplots(rows, COLUMNS, figsize=(9.0, 2.6 * rows), layout="constrained")
+    figure.get_layout_engine().set(h_pad=0.12)
     for panel in panels.flat[len(CATALOGUE) :]:
         panel.axis("off")
     for number, (panel, failure) in enumerate(zip(panels.flat, CATALOGUE.values(), strict=False), 1):

@@ -160,7 +160,7 @@ def draw(folder: Path, found: Structure) -> None:
             for end in ends[:-1]:
                 line(end - 0.5, color="0.6", linewidth=0.6)
         axes.tick_params(length=0)
-        pyplot.setp(axes.get_xticklabels(), rotation=25, ha="right")
+        pyplot.setp(axes.get_xticklabels(), rotation=45, ha="right", rotation_mode="anchor")
         axes.set_title(f"{name}, {matrix.shape[0]} × {matrix.shape[1]}, {filled.sum()} elements", fontsize=10)
         plot.savefig(folder / f"figure-{figure}-{name}.png", dpi=DOTS_PER_INCH)
         pyplot.close(plot)
