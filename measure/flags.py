@@ -184,7 +184,9 @@ PLACEMENTS_BY_CHANCE = _limit(
     "no frame is measured there",
 )
 FRAME_BY_CHANCE = _limit(
-    0.05, "p-value of the frame, where only some of its marks are found", "its marks are weak, its pose assumed"
+    0.05,
+    "p-value of the frame, where only some of its marks are found",
+    "its marks are weak, its scan orientation assumed",
 )
 NO_FRAME = _limit(  # likelier than not
     0.5,

@@ -288,7 +288,7 @@ def term_reason(term: str, poses: Sequence[Pose], confused_with: str) -> Reason:
         )
     else:
         listed = ", ".join(f"{turn}{' mirrored' if mirrored else ''}" for turn, mirrored in poses)
-        because = f"it, or its sum with others, looks the same in all poses in which the frames lie ({listed} degrees)"
+        because = f"it, or its sum with others, is the same in all orientations of the scans ({listed} degrees)"
     return Reason(because, given, otherwise)
 
 

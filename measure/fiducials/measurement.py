@@ -126,7 +126,7 @@ def _rename(frame: Frame, pose: Pose) -> tuple[Frame, Pose]:
     renamed = rename_frame(frame.scan, frame, pose.name)
     if renamed is not frame:
         return renamed, pose
-    against = f"fewer of the marks agree in pose {pose.name} than in pose {frame.placement.pose}, which is assumed."
+    against = f"fewer marks agree in orientation {pose.name} than in {frame.placement.pose}, which is assumed."
     return frame, replace(pose, name=frame.placement.pose, decided=False, evidence=(*pose.evidence, against), rivals=())
 
 
@@ -160,8 +160,8 @@ def _against_the_set_pose(frame: Frame, lines: Sequence[Line]) -> Reason:
         return NO_REASON
     evidence = " ".join(pose.evidence).rstrip(".")
     return Reason(
-        f"pose {own} is set in the project, but the marks of this frame show {pose.name}, "
-        f'and then the marks have other names (pose = "auto" takes each scan as it lies): {evidence}',
+        f"scan orientation {own} is set in the project, but the marks of this frame show {pose.name}, "
+        f'and then the marks have other names (scan_orientation = "auto" takes each scan as it lies): {evidence}',
         Code.POSE,
     )
 

@@ -20,7 +20,7 @@ _LEAST_MARKS = 3  # with two, a false one yields a wrong pitch
 _REACH_PX = 20.0  # around a mark of unknown size: that of a disk or crossing of a test field, with its background
 _PLAIN_PX = 3.0  # px across the finest line of a mark: both edges and the inside are resolved
 _ASSUMED = Reason(
-    "the frame's pose is only assumed, and another of the learned marks would have its origin elsewhere", Code.POSE
+    "the scan orientation is only assumed, and another of the learned marks would have its origin elsewhere", Code.POSE
 )
 _OWN = Reason("its template is its own picture: nothing checks its place", Code.OWN_PICTURE)
 

@@ -187,7 +187,7 @@ def _decision(
 ) -> Pose:
     """Select the most likely orientation, with the evidence in sentences. found: number of marks found."""
     if not hypotheses:
-        return Pose("0", False, ("no pose names the marks that were found.",))
+        return Pose("0", False, ("no scan orientation names the marks that were found.",))
     best_likelihood = max(each.likelihood for each in hypotheses)
     alike = [each for each in hypotheses if best_likelihood - each.likelihood < DECIDED]
     best = max(alike, key=lambda each: each.total)
@@ -195,7 +195,7 @@ def _decision(
     against = _against(best, max(others, key=lambda each: each.total), layout, lines) if others else ()
     written, main = {each.pose: each.writing for each in hypotheses} if lines else {}, main_pose(lines)
     if len(alike) == 1:
-        reasons = against or (f"no other pose explains the {found} marks found.",)
+        reasons = against or (f"no other scan orientation explains the {found} marks found.",)
         return Pose(best.pose, True, reasons, written, main)
     first, lead = alike[0].pose, best.total - alike[0].total
     near = [each.pose for each in alike if best.total - each.total < TOLD]
@@ -208,13 +208,13 @@ def _decision(
         equal = [pose for pose in near if pose != assumed]
         as_likely = f"as likely as {', '.join(equal)} and " if equal else ""
         sentence = (
-            f"the {found} marks found do not separate the poses {names} significantly: {chosen}, "
+            f"the {found} marks found do not separate the scan orientations {names} significantly: {chosen}, "
             f"{as_likely}likelier than {first} by log-odds of only {lead:.1f}."
         )
     else:
         sentence = (
-            f"nothing in the {found} marks found separates the poses {names}: their pictures and given coordinates are "
-            f"alike; {chosen}."
+            f"nothing in the {found} marks found separates the scan orientations {names}: their pictures and given "
+            f"coordinates are alike; {chosen}."
         )
     rivals = tuple(pose_in_camera(each.pose, assumed) for each in alike if each.pose != assumed)
     return Pose(assumed, False, (sentence, *against), written, main, rivals=rivals)
@@ -228,14 +228,14 @@ def _against(best: _Hypothesis, rival: _Hypothesis, layout: FiducialLayout, line
         telling = [site for site in np.argsort(-by_site, kind="stable").tolist() if by_site[site] > TOLD]
         kinds = sorted({_difference(best.names[site], rival.names[site], layout) for site in telling})
         sentences.append(
-            f"{' and '.join(kinds)} at {len(telling)} of {len(by_site)} marks are evidence against the next best pose "
-            f"{rival.pose} with log-odds {lead:.1f}."
+            f"{' and '.join(kinds)} at {len(telling)} of {len(by_site)} marks are evidence against the next best "
+            f"orientation {rival.pose} with log-odds {lead:.1f}."
         )
     asymmetry = float(np.sqrt(max(rival.chi_square - best.chi_square, 0.0)))
     if abs(best.coordinates - rival.coordinates) > TOLD:
         word = "against" if best.coordinates > rival.coordinates else "for"
         sentences.append(
-            f"the asymmetry of the marks' given coordinates, {asymmetry:.1f} sigmas, is evidence {word} pose "
+            f"the asymmetry of the marks' given coordinates, {asymmetry:.1f} sigmas, is evidence {word} orientation "
             f"{rival.pose} with log-odds {abs(best.coordinates - rival.coordinates):.1f}."
         )
     if abs(best.writing - rival.writing) > TOLD:
@@ -253,13 +253,13 @@ def _writing_sentence(best: _Hypothesis, rival: _Hypothesis, layout: FiducialLay
     telling = [index for index in np.argsort(-np.array(by_line), kind="stable").tolist() if by_line[index] > 0]
     quoted = ", ".join(f'"{lines[index].text}"' for index in telling[:_QUOTED])
     word = "against" if lead > 0 else "for"
-    return f"the writing, such as {quoted}, is evidence {word} pose {rival.pose} with log-odds {abs(lead):.1f}."
+    return f"the writing, such as {quoted}, is evidence {word} orientation {rival.pose} with log-odds {abs(lead):.1f}."
 
 
 def _difference(one: int, other: int, layout: FiducialLayout) -> str:
     """Feature that distinguishes two marks of the camera."""
     if one < 0 or other < 0:
-        return "marks where the other pose has none"
+        return "marks where the other orientation has none"
     (core, dots), (other_core, other_dots) = (_figure(layout.marks[index].mark) for index in (one, other))
     if core != other_core:
         return "different marks"

@@ -21,7 +21,7 @@ class Verdict(MeaningfulWord):
     LOOK = (
         "look",
         "Usable, but a fiducial is weak, missing or rejected, no target is measured, or the frame has a problem "
-        "(assumed pose, ...).",
+        "(assumed scan orientation, ...).",
     )
     POOR = "poor", "Hardly usable: too few marks for an interior orientation, or for a check of it."
     FAILED = "failed", "Nothing was measured: the file is missing, damaged or not a scan, or its process was killed."
@@ -70,16 +70,16 @@ def scan_verdict(scan: "MeasuredScan", marks: Sequence[MarkState] | None = None)
 
 def scan_doubt(scan: "MeasuredScan") -> str:
     """First reason why a scan needs a look; "" if it needs none."""
-    frame = scan.frame
+    frame, pose = scan.frame, scan.frame.pose
     if not scan_verdict(scan).needs_review:
         return ""
-    of_pose = [f"pose {frame.pose.name} is assumed"] if frame.pose is not None and not frame.pose.decided else []
+    of_pose = [f"scan orientation {pose.name} is assumed"] if pose is not None and not pose.decided else []
     marks = (mark for mark in frame.marks if mark.reason and not is_answered(mark.reason.codes))
     return next(chain(frame.problems, of_pose, (f"{mark.point}: {mark.reason}" for mark in marks)), "")
 
 
 def has_problem(scan: "MeasuredScan") -> bool:
-    """Whether the frame as a whole needs a look, for example because its pose is assumed."""
+    """Whether the frame as a whole needs a look, for example because its scan orientation is assumed."""
     frame = scan.frame
     return bool(frame.problems) or (frame.pose is not None and not frame.pose.decided)
 

@@ -328,7 +328,7 @@ def run_block(
         pictures = write_pictures(tasks, cameras, folder)
     with _step(seconds, "features, matches and mapping"):
         found = mapped(pictures, cameras, folder)
-    with _step(seconds, "tracks and poses back"):
+    with _step(seconds, "tracks and exterior orientations"):
         ties = tie_marks(found, pictures)
         interior = {picture.image: given_interior(cameras[picture.camera]) for picture in pictures}
         poses = oriented_by_control(found, pictures, marks, project.object_points, interior)

@@ -51,7 +51,7 @@ def write_metashape(block: Block, options: ExportOptions) -> Written:
     frames = [frame for frame in frames if frame.camera not in digital]
     if not frames:
         notes.append("A digital camera: Tools > Camera Calibration loads the XML file in Metashape.")
-        return Written(files, ("standard deviations, poses, points and marks",), tuple(notes), left_out)
+        return Written(files, ("standard deviations, exterior orientations, points and marks",), tuple(notes), left_out)
     data = {
         "cameras": {camera: _camera(block, camera, files) for camera in dict.fromkeys(f.camera for f in frames)},
         "images": [_image(frame) for frame in frames],
@@ -63,7 +63,7 @@ def write_metashape(block: Block, options: ExportOptions) -> Written:
         "The fiducials' y is given downward, as that of the pixels; no public page says which way Metashape takes it. "
         "Look at its picture after calibrateFiducials: the frame must stand upright."
     )
-    lost = ("the standard deviations of marks", "the poses but for their stations", "what is not affine in the film")
+    lost = ("the standard deviations of marks", "the angles of the images", "what is not affine in the film")
     return Written(files, lost, tuple(notes), left_out)
 
 

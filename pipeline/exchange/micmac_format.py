@@ -98,7 +98,7 @@ def _camera_files(block: Block, camera: str, options: ExportOptions) -> Written:
     if not oriented:
         has_frame = bool(fiducials and frames) and block.camera_file(camera).frame_mm is not None
         command = (_resampling(camera, film_box(block, frames[0], options)),) if has_frame else ()
-        without = f"{camera}: no image is oriented, so there are marks only: camera and poses come by object points."
+        without = f"{camera}: no image is oriented, so there are marks only: its calibration needs object points."
         return Written(files, notes=(*command, without), left_out=left_out)
     lens = sheared_lens(block, oriented[0], at_ideal=True)
     box = camera_box(block, oriented[0], options)
@@ -292,7 +292,7 @@ def write_mmvii(block: Block, options: ExportOptions) -> Written:
         if marks
     }
     without_sigma = sum(mark.sigma_mm is None for *_, marks in kinds for mark in marks)
-    lost = ("of the marks nothing; camera, poses and points do not go out",)
+    lost = ("of the marks nothing; camera, exterior orientations and points do not go out",)
     note = f"{without_sigma} marks have no standard deviation of their own: Sigma2 is 1 0 1 px."
     return Written(files, lost, (note,) if without_sigma else ())
 

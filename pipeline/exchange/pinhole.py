@@ -547,7 +547,7 @@ def import_colmap(paths: Sequence[Path], options: ImportOptions) -> Incoming:
                 pose = image.cam_from_world()
                 poses.append(foreign_pose(image_name(image.name), pose.rotation.matrix(), pose.translation))
     poses.sort(key=lambda pose: pose.image)
-    notes.append("The poses are approximations, in the coordinates of that reconstruction.")
+    notes.append("The exterior orientations are approximations, in the coordinates of that reconstruction.")
     return Incoming(cameras=tuple(cameras), poses=tuple(poses), notes=tuple(notes))
 
 

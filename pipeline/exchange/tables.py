@@ -190,7 +190,7 @@ def write_bingo(block: Block, options: ExportOptions) -> Written:
         texts.append("\n".join(lines) + "\n")
     lost = (
         "standard deviations (BINGO takes them by groups)",
-        "poses and object points, whose files no public text describes",
+        "exterior orientations and object points, whose files no public text describes",
         "fiducial marks",
     )
     return Written({"bingo.txt": "\n".join(texts)}, lost, tuple(interior.values()), tuple(left_out))

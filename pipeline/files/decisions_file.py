@@ -44,7 +44,7 @@ class Choice(MeaningfulWord):
     PLACE = "place", "The mark is here (`col_px`, `row_px`): matching starts there."
     POSE = "pose", "The scan lies as `pose` says."
     LEARN = "learn", "The camera's marks look as at these places of this scan (`px`, column and row by fiducial)."
-    UNDO = "undo", "The last decision about this mark, or this pose, is taken back."
+    UNDO = "undo", "The last decision about this mark, or this scan orientation, is taken back."
 
 
 About = tuple[str, str, str]  # image, point, kind; of a pose: image, "", ""; of marks to be learned: image, "", LEARNED
@@ -138,7 +138,7 @@ def _check_decision(decision: Decision) -> Decision:
             raise WrongKey(key, message)
     of_scan = kind in (Choice.POSE, Choice.LEARN)
     if of_scan and decision.point:
-        what = "a pose" if kind is Choice.POSE else "what is learned"
+        what = "a scan orientation" if kind is Choice.POSE else "what is learned"
         raise WrongKey("point", f"is of no use: {what} is of the whole scan. Take it out.")
     if of_scan and decision.kind != (own := LEARNED if kind is Choice.LEARN else ""):
         decision = replace(decision, kind=own)

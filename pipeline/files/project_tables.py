@@ -177,15 +177,28 @@ def _pitch(value: Any) -> tuple[float, float]:
     return pitch
 
 
+_ORIENTATION = choice("auto", *POSES)
+
+
 @table_model
 class MeasureTable:
     """The table [measure]."""
 
-    pose: Annotated[
-        str, choice("auto", *POSES), "Scan orientation: counter-clockwise turn of the scan, then m if mirrored."
-    ] = "auto"
+    scan_orientation: Annotated[
+        str | None, _ORIENTATION, "Counter-clockwise turn of the scan, then m if mirrored; absent: auto."
+    ] = None
+    pose: Annotated[str | None, _ORIENTATION, "Another name of scan_orientation."] = None
     writing: Annotated[Reads, "In which scans the writing about the frame is read."] = "pose"
     tone: Annotated[float | str, number_or_word("auto", *TONES), "How grey values grow with light."] = "auto"
+
+    def __post_init__(self) -> None:
+        """Raises WrongKey where both names of the scan orientation are given."""
+        if self.pose and self.scan_orientation:
+            raise WrongKey("pose", "and scan_orientation are one key. Take one of them out.")
+
+    @property
+    def orientation(self) -> str:
+        return self.scan_orientation or self.pose or "auto"
 
 
 @table_model

@@ -95,7 +95,7 @@ def _check_orientation(camera: CameraFile, task: ScanTask, scan: Scan, px: Place
     raise InputError(
         f"{camera.path}: the clicks in {task.name} show the frame in the scan orientation {clicked}, and the project "
         f"{does}. {tag}Click the marks in `reseau review`, which shows it as stored, or set the right orientation "
-        "(pose, in [measure])."
+        "(scan_orientation, in [measure])."
     )
 
 

@@ -164,8 +164,8 @@ def _contradicted(scan: MeasuredScan, other: MeasuredScan, off_mm: float) -> Mea
         f"them {off_mm:.1f} mm apart"
     )
     problem = Reason(
-        f"{capitalised(what)}. One of the frames lies elsewhere than it was found, or in another pose: look at "
-        "both, and place the marks or set the pose in a review.",
+        f"{capitalised(what)}. One of the frames lies elsewhere than it was found, or in another scan orientation: "
+        "look at both, and place the marks or set the scan orientation in a review.",
         Code.AMBIGUOUS,
     )
     if len(_fiducials(scan)) <= len(_fiducials(other)):

@@ -202,7 +202,8 @@ def _assumed_pose(frame: Frame) -> Iterator[Problem]:
     else:
         yield Problem(
             f"pose assumed ({pose.name}). {' '.join(map(capitalised, pose.evidence))}",
-            'If the scan was laid on the scanner otherwise, set pose = "90", "180", "270" or with "m" under [measure].',
+            'If the scan was laid on the scanner otherwise, set scan_orientation = "90", "180", "270" or with "m" '
+            "under [measure].",
         )
 
 
@@ -245,7 +246,7 @@ def _measurement_problems(frame: Frame) -> Iterator[Problem]:
     if targets and not is_lost and not is_explained and not any(mark.status.is_observation for mark in targets):
         yield Problem(
             f"none of its {len(targets)} targets was measured.",
-            "Look at their reasons in comparator.csv: a wrong pose, diameter or orientation misses them all.",
+            "Look at their reasons in comparator.csv: a wrong orientation, scan orientation or diameter misses all.",
         )
 
 

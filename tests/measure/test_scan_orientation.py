@@ -133,7 +133,7 @@ def test_where_no_place_is_known_frames_are_named_so_that_their_writing_is_uprig
     assert not found.decided
     assert pose_in_camera(found.writing, found.name) == "0"
     assert "in which most of what is written is upright" in found.evidence[0]
-    assert "is evidence against pose 0 with log-odds 8.0" in found.evidence[1]
+    assert "is evidence against orientation 0 with log-odds 8.0" in found.evidence[1]
 
 
 def test_nothing_is_read_where_nobody_asks_and_a_mirror_is_not_assumed() -> None:

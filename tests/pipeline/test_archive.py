@@ -287,7 +287,7 @@ def test_status_says_why_a_scan_needs_attention(folder: Path) -> None:
     assumed = replace(scan, frame=replace(scan.frame, pose=Pose("90", decided=False)))
     doubted = scan.restated("fiducial", Status.WEAK, Reason("it is dusty", Code.DUST))
     assert scan_doubt(scan) == ""
-    assert scan_doubt(assumed) == "pose 90 is assumed"
+    assert scan_doubt(assumed) == "scan orientation 90 is assumed"
     assert scan_doubt(assumed.changed(problems=[Reason("it is bent", Code.PITCH)])) == "it is bent"
     assert scan_doubt(doubted) == f"{scan.frame.marks[0].point}: it is dusty"
 

@@ -289,6 +289,11 @@ def set_status(first: str, others: str, columns: str) -> Changes:
         ("project.toml", setting('scanner = "bend"\nscanner_sigma_um = 0.0'), ["would fix every term at 0"]),
         ("project.toml", {'"affine"': '"none"\nscanner = "bend"'}, ["a digital camera no scanner"]),
         ("project.toml", {OBJECT: "[ties]\nimages = 2\n[object]\n"}, ["images: must be", "at least 3, not 2"]),
+        (
+            "project.toml",
+            {OBJECT: '[measure]\npose = "0"\nscan_orientation = "0"\n[object]\n'},
+            ["pose: and scan_orientation are one key"],
+        ),
         ("project.toml", {OBJECT: "[ties]\nwanted = 0\n[object]\n"}, ["wanted: must be", "at least 1, not 0"]),
         ("project.toml", {OBJECT: "[ties]\nheight = 3.0\n[object]\n"}, ["height_sigma"]),
         ("project.toml", {OBJECT: "[ties]\nhight = 3.0\n[object]\n"}, ["hight"]),

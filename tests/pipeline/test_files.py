@@ -76,6 +76,12 @@ def bare_project(folder: Path, text: str, *files: str) -> Project:
     return read_project(write_tables(folder, text, camera=camera, comparator=comparator))
 
 
+@pytest.mark.parametrize("key", ["pose", "scan_orientation"])
+def test_the_scan_orientation_has_two_names(key: str, tmp_path: Path) -> None:
+    assert bare_project(tmp_path, f'[measure]\n{key} = "90m"\n').pose == "90m"
+    assert bare_project(tmp_path, "[measure]\n").pose == "auto"
+
+
 def test_a_project_whose_camera_is_unknown_yet_is_refused_with_what_to_do(tmp_path: Path) -> None:
     (tmp_path / "a.tif").touch()
     path = written(tmp_path, "project.toml", 'scans = ["a.tif"]\n')

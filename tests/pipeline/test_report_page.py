@@ -391,7 +391,7 @@ def test_an_assumed_pose_needs_attention_once(measured_data: ReportData, adjuste
     data = set_frames(measured_data, lambda frame: replace(frame, pose=pose))
     assert len(judge(data).problems) == 1
     assert "f1, f2, f3, f4, f5: pose assumed (0). The marks are symmetric to 3 µm." in describe(data)
-    assert 'pose = "90"' in describe(data)
+    assert 'set scan_orientation = "90"' in describe(data)
     cameras = present(adjusted_data.adjustment).cameras
     unknown = {name: replace(each, principal_distance_mm=Quantity(153.0, np.nan)) for name, each in cameras.items()}
     bare = changed(adjusted_data, cameras=unknown)

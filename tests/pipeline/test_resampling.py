@@ -276,7 +276,8 @@ def test_a_frame_whose_place_in_the_scan_is_in_doubt_says_so(tmp_path: Path, mon
     stage = "pipeline.resampling.resample_stage"
     monkeypatch.setattr(f"{stage}.read_comparator", lambda *given: ())
     monkeypatch.setattr(f"{stage}.image_chain", lambda *given: FrameChain(PITCH_UM, film(0.4, False)[0]))
-    for is_oriented, doubt in ((None, "pose 90 is assumed"), (False, "pose 90 is assumed"), (True, "")):
+    assumed = "scan orientation 90 is assumed"
+    for is_oriented, doubt in ((None, assumed), (False, assumed), (True, "")):
         record = SimpleNamespace(exterior=SimpleNamespace(is_oriented=is_oriented))
         adjustment = None if is_oriented is None else SimpleNamespace(images={"2": record})
         monkeypatch.setattr(f"{stage}.current_adjustment", lambda *given, adjustment=adjustment: adjustment)

@@ -430,7 +430,7 @@ def test_lines_of_all_forms_are_read_in_their_order(path: Path) -> None:
         ('{"image": "a", "decision": "place", "point": "1", "col_px": 1}', "row_px: must be a number of pixels"),
         ('{"image": "a", "decision": "place", "point": "1", "col_px": true, "row_px": 1}', "col_px: must be a number"),
         ('{"image": "a", "decision": "pose", "pose": "91"}', "pose: must be one of"),
-        ('{"image": "a", "decision": "pose", "pose": "90", "point": "1"}', "a pose is of the whole scan"),
+        ('{"image": "a", "decision": "pose", "pose": "90", "point": "1"}', "a scan orientation is of the whole scan"),
         ('{"image": "a", "decision": "accept", "point": "1", "when": "now"}', "when: must be a time"),
         ('["a"]', "line 2: must be a JSON object"),
     ],
@@ -525,7 +525,7 @@ def test_what_is_settled_is_not_open_and_commands_say_whose(tmp_path: Path, caps
     assert command("measure", project) == 1
     append_decisions(project.with_name("decisions.jsonl"), [mark_decision(Choice.ABSENT, "5", who="ann lee")])
     (stale,) = json.loads(printed("status", project, "--json", code=1))["images"].values()
-    assert (stale["verdict"], "not taken in yet" in stale["why"]) == ("old", True)
+    assert (stale["verdict"], "not applied yet" in stale["why"]) == ("old", True)
     assert command("measure", project) == 0
     verdicts = json.loads(printed("status", project, "--json"))["verdicts"]
     assert (verdicts["decided"]["scans"], verdicts["good"]["scans"], verdicts["look"]["scans"]) == (1, 0, 0)

@@ -45,8 +45,8 @@ function take(page, keep = true) {
 
 function showQueue() {
   const { left, optional, total, shown, shown_left: shownLeft, start } = state.page;
-  const kinds = [["camera", "cameras"], ["pose", "poses"], ["frame", "frames"], ["mark", "marks"]];
-  const parts = kinds.filter(([one]) => left[one]).map(([one, many]) => `${left[one]} ${left[one] === 1 ? one : many}`);
+  const kinds = [["camera", "cameras"], ["pose", "scan orientations"], ["frame", "frames"], ["mark", "marks"]];
+  const parts = kinds.filter(([one]) => left[one]).map(([one, many]) => `${left[one]} ${left[one] === 1 ? many.slice(0, -1) : many}`);
   const done = total ? "No open questions. Run reseau measure." : optional ? "No question needs an answer" : "Nothing to decide yet.";
   const more = optional ? `; ${optional} optional` : "";
   by("left").textContent = (left.all ? `${left.all} left: ${parts.join(", ")}` : done) + more;
@@ -73,14 +73,14 @@ function queueItem(entry, index) {
   return item;
 }
 
-const short = ({ decision, pose, image, who }) => `${decision}${pose ? ` ${pose}` : ""}${decision === "learn" ? ` from ${image}` : ""}, ${who}`;
+const short = ({ decision, pose, image, who }) => `${pose ? `scan orientation ${pose}` : decision}${decision === "learn" ? ` from ${image}` : ""}, ${who}`;
 const isLeft = (entry) => entry.is_left && !entry.answer;
 
 function title(entry) {
   if (entry.question === "camera") return `${entry.camera}: how its marks look`;
   if (entry.question === "mark") return `${entry.image}: ${entry.kind} ${entry.point}`;
   const more = entry.count > 1 ? ` and ${entry.count - 1} more` : "";
-  return entry.question === "pose" ? `${entry.image}${more}: how it lies` : `${entry.image}: no mark was found`;
+  return entry.question === "pose" ? `${entry.image}${more}: scan orientation` : `${entry.image}: no mark was found`;
 }
 
 async function open(index) {
@@ -579,7 +579,7 @@ function counted({ marks, pose, problems }) {
   const counts = {};
   for (const { status } of marks) counts[status] = (counts[status] ?? 0) + 1;
   const told = Object.entries(counts).map(([status, count]) => `${count} ${status}`).join(", ");
-  return `${[told, pose && `pose ${pose}`].filter(Boolean).join("; ")}. ${problems.join(" ")}`;
+  return `${[told, pose && `scan orientation ${pose}`].filter(Boolean).join("; ")}. ${problems.join(" ")}`;
 }
 
 function keepClicks() {
