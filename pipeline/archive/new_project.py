@@ -153,7 +153,10 @@ class NewProject:
             yield f"Cameras' numbers on plates in the samples: {', '.join(plates)}."
         if self.found.endings:
             others = sorted(self.found.endings.items(), key=lambda item: -item[1])[:_SHOWN]
-            named = (f"{count} files {f'that end in {end}' if end else 'without an ending'}" for end, count in others)
+            named = (
+                f"{counted(count, 'file')} {f'with the ending {end}' if end else 'without an ending'}"
+                for end, count in others
+            )
             yield f"Not examined: {', '.join(named)}."
 
     def as_json(self) -> Mapping[str, object]:

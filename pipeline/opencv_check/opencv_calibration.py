@@ -1,4 +1,4 @@
-"""Calibration of observations in the camera frame by cv2.calibrateCameraExtended and cv2.fisheye.calibrate.
+"""Calibration of observations in the camera frame by cv2.calibrateCamera and cv2.fisheye.calibrate.
 
 Parameters are OpenCV's in the unit of the camera frame: fx, fy, cx, cy in mm, where cx and cy are the principal point
 x0', y0' (y up); k1 to s4 and the fisheye's alpha without unit; the sensor's tilt tau_x, tau_y in rad.
@@ -171,7 +171,7 @@ def calibrate(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> 
     flags |= cv2.CALIB_TILTED_MODEL if tilted else 0
     flags |= 0 if {"fx", "fy"} <= set(freedom.names) else cv2.CALIB_FIX_ASPECT_RATIO
     with one_opencv_thread():  # several threads sum the images in the order they finish, which is not reproducible
-        rms_px, adjusted_matrix, distortion, _, _, sigmas, _, _ = cv2.calibrateCameraExtended(
+        rms_px, ended, distortion, rotations, shifts = cv2.calibrateCamera(
             objects,
             rounded,
             pixels.size,
@@ -180,12 +180,20 @@ def calibrate(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> 
             flags=flags,
             criteria=CRITERIA,
         )
-    values = np.zeros(len(NAMES) - 4)
+    matrix, values = np.asarray(ended, dtype=np.float64), np.zeros(len(NAMES) - 4)
     values[: np.size(distortion)] = np.ravel(distortion)[: len(values)]  # OpenCV returns no tilt if it is not estimated
+    derivatives = [
+        np.asarray(cv2.projectPoints(xyz, turn, shift, matrix, values)[1], np.float64)
+        for xyz, turn, shift in zip(pixels.objects, rotations, shifts, strict=True)
+    ]
+    if "fy" not in freedom.names:  # which goes with fx
+        for each in derivatives:
+            each[:, 6] += each[:, 7] * start[1] / start[0]
+    own = [NAMES.index(name) for name in freedom.names]
     rounding_px = np.concatenate([a - b for a, b in zip(pixels.places, rounded, strict=True)])
     return OpenCvCalibration(
-        parameters=np.concatenate([pixels.interior_mm(np.asarray(adjusted_matrix, dtype=np.float64)), values]),
-        sigmas=_sigmas(np.ravel(sigmas), freedom, start, pixels.mm),
+        parameters=np.concatenate([pixels.interior_mm(matrix), values]),
+        sigmas=_sigmas([(each[:, :6], each[:, 6:]) for each in derivatives], own, float(rms_px), pixels.mm),
         rms_um=1e3 * pixels.mm * float(rms_px),
         rounding_um=1e3 * pixels.mm * float(np.sqrt((rounding_px**2).mean())),
     )
@@ -195,9 +203,8 @@ def calibrate_fisheye(images: Sequence[ImagePoints], freedom: Freedom, start: Ar
     """OpenCV's least squares of a fisheye with initial values `start` (9,); parameters that are not in `freedom` are
     held.
 
-    OpenCV returns no standard deviations for a fisheye: they are computed from its derivatives at the solution. It uses
-    double precision; the accuracy of its solution is limited by a gradient that is not exactly 0. Raises cv2.error
-    where OpenCV fails.
+    OpenCV uses double precision; the accuracy of its solution is limited by a gradient that is not exactly 0. Raises
+    cv2.error where OpenCV fails.
     """
     pixels = _Pixels.from_images(images, start)
     begun = pixels.matrix(start)
@@ -214,31 +221,41 @@ def calibrate_fisheye(images: Sequence[ImagePoints], freedom: Freedom, start: Ar
         )
     matrix = np.asarray(ended, dtype=np.float64)
     alpha = float(matrix[0, 1] / matrix[0, 0])
-    by_camera = [
-        _fisheye_derivatives(xyz, np.ravel(turn), np.ravel(shift), matrix, np.ravel(distortion), alpha)
+    derivatives = [
+        np.asarray(cv2.fisheye.projectPoints(xyz[None], turn, shift, matrix, distortion, alpha=alpha)[1], np.float64)
         for xyz, turn, shift in zip(pixels.objects, rotations, shifts, strict=True)
     ]
     own = [FISHEYE_NAMES.index(name) for name in freedom.names]
-    normal = sum((each[:, own].T @ each[:, own] for each in by_camera), start=np.zeros((len(own), len(own))))
-    squares = len(pixels.places_px) * float(rms_px) ** 2
-    redundancy = 2 * len(pixels.places_px) - 6 * len(images) - len(own)
-    sigmas = np.zeros(len(FISHEYE_NAMES))
-    sigmas[own] = np.sqrt(squares / redundancy * np.diag(np.linalg.inv(normal)))
-    sigmas[:4] *= pixels.mm
+    by_pose_camera = [(each[:, 8:14], each[:, [*range(8), 14]]) for each in derivatives]
     return OpenCvCalibration(
         parameters=np.concatenate([pixels.interior_mm(matrix), np.ravel(distortion), [alpha]]),
-        sigmas=sigmas,
+        sigmas=_sigmas(by_pose_camera, own, float(rms_px), pixels.mm),
         rms_um=1e3 * pixels.mm * float(rms_px),
         rounding_um=1e3 * pixels.mm * PICTURE_PX * float(np.finfo(np.float64).eps),
     )
 
 
-def _fisheye_derivatives(xyz: Array, turn: Array, shift: Array, matrix: Array, lens: Array, alpha: float) -> Array:
-    """(2 n, 9) derivatives by the camera's parameters, orthogonal to those by the exterior orientation."""
-    _, jacobian = cv2.fisheye.projectPoints(xyz[None], turn, shift, matrix, lens, alpha=alpha)
-    pose = np.linalg.qr(jacobian[:, 8:14])[0]
-    by_camera = jacobian[:, [*range(8), 14]]
-    return np.asarray(by_camera - pose @ (pose.T @ by_camera))
+def _sigmas(by_pose_camera: Sequence[tuple[Array, Array]], own: Sequence[int], rms_px: float, pixel_mm: float) -> Array:
+    """Standard deviations (m,) of a camera's parameters from OpenCV's derivatives at its solution.
+
+    OpenCV returns none of a fisheye. Its others come from normal equations, in which it drops directions that hardly
+    change the residuals, such as c of a board that is never tilted.
+
+    by_pose_camera: by image, derivatives (2 n, 6) by the exterior orientation and (2 n, m) by the camera's parameters;
+    own: those that are estimated.
+    """
+    reduced = []
+    for by_pose, by_camera in by_pose_camera:
+        pose = np.linalg.qr(by_pose)[0]
+        reduced.append(by_camera[:, own] - pose @ (pose.T @ by_camera[:, own]))
+    stacked = np.concatenate(reduced)
+    scales = np.linalg.norm(stacked, axis=0)
+    root = np.linalg.inv(np.linalg.qr(stacked / scales, mode="r"))
+    share = len(stacked) / (len(stacked) - 6 * len(reduced) - len(own)) / 2.0
+    sigmas = np.zeros(by_pose_camera[0][1].shape[1])
+    sigmas[own] = rms_px * np.sqrt(share) * np.linalg.norm(root, axis=1) / scales
+    sigmas[:4] *= pixel_mm
+    return sigmas
 
 
 @dataclass(frozen=True)
@@ -287,11 +304,3 @@ class _Pixels:
     def interior_mm(self, matrix: Array) -> Array:
         """fx, fy, cx, cy (4,), y up, from a camera matrix in px."""
         return np.concatenate([np.diag(matrix)[:2], (matrix[:2, 2] + self.offset) * Y_UP]) * self.mm
-
-
-def _sigmas(sigmas: Array, freedom: Freedom, start: Array, pixel_mm: float) -> Array:
-    """Standard deviations in the order of NAMES. With a held ratio of focal lengths OpenCV returns only that of fy."""
-    found = sigmas[: len(NAMES)] * np.where(np.arange(len(NAMES)) < 4, pixel_mm, 1.0)
-    if "fy" not in freedom.names:
-        found[0] = found[1] * start[0] / start[1]
-    return found

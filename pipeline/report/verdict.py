@@ -41,6 +41,7 @@ GIVEN = ("datum", "interior")  # groups of values that the camera's file gives
 LEAST_ALIKE, NEARLY_ALL = 6, 0.8  # number and share of suspects in one image from which its numbers may be wrong
 MOST_QUANTITIES = 3  # largest number of contradicted quantities named
 LEAST_SHARE = 0.5  # fraction of the corner radius up to which a lens must be observed
+LOOSE = 0.01  # fraction of c, standard deviation above which images do not separate it from their distances
 CONFIDENCE = 0.99  # of the global test, and family-wise confidence of the tests of residuals
 
 _CONTRADICTED_BY = "contradicted by the images (p < 0.01"
@@ -252,7 +253,18 @@ def _sigma0_and(side: str, bound: float, sigma0: float) -> str:
 
 
 def _lens_problems(data: ReportData) -> Iterator[Problem]:
-    """Yield problems of lenses observed out to less than half the corner radius."""
+    """Yield problems of lenses observed out to less than half the corner radius, and of principal distances that the
+    images alone have to determine and hardly do."""
+    solved = _solved(data)
+    for name, camera in solved.cameras.items() if solved else ():
+        c = camera.principal_distance_mm
+        if not (c.given and math.isfinite(c.given.sigma)) and c.sigma > LOOSE * c.value:
+            yield Problem(
+                f"The principal distance of {name} is known to {100.0 * c.sigma / c.value:.1g} % only: the images "
+                "hardly separate it from how far away they were taken.",
+                "Tilt the board, or the camera, by 20 to 45 degrees in different directions.",
+                section="camera",
+            )
     # From there to the corner the term of k3 grows by 2^7 = 128: a hundredth of a pixel becomes more than a pixel.
     remedy = "Observe targets out to the corners of the picture, or use the lens within that radius only."
     for _, sentence, share in lens_sentences(data):

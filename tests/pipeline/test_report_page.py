@@ -1,5 +1,6 @@
 """report.html as a whole: well-formed, self-contained, and saying what is there in every state of a project."""
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,7 +24,7 @@ from pipeline.report.data import frames
 from pipeline.report.frame_problems import fraction_test, places_px
 from pipeline.report.parameters import spoken_name
 from pipeline.report.verdict import NEEDS_A_LOOK, critical_w, sigma0_bounds
-from pipeline.results.adjustment_record import Quantity, Sigma0Record
+from pipeline.results.adjustment_record import GivenQuantity, Quantity, Sigma0Record
 from pipeline.results.assessment_record import CorrelationRecord, SuspectRecord
 from pipeline.results.stage_files import Check
 
@@ -402,6 +403,21 @@ def test_an_assumed_pose_needs_attention_once(measured_data: ReportData, adjuste
     result = " ".join(verdict.notes)
     assert "if two scans bear each other's names, nothing here shows it" in result
     assert "OpenCV cannot check" not in result
+
+
+@pytest.mark.parametrize(
+    ("given", "sigma", "is_problem"), [(math.nan, 9.0, True), (math.nan, 0.9, False), (9.0, 9.0, False)]
+)
+def test_a_free_principal_distance_that_images_hardly_determine(
+    adjusted_data: ReportData, given: float, sigma: float, is_problem: bool
+) -> None:
+    """c is 153 mm; 9 mm are 6 % of it. A given one of that standard deviation is what the user says."""
+    cameras = {
+        name: replace(camera, principal_distance_mm=Quantity(153.0, sigma, GivenQuantity(153.0, given)))
+        for name, camera in present(adjusted_data.adjustment).cameras.items()
+    }
+    found = [each.what for each in judge(changed(adjusted_data, cameras=cameras)).problems]
+    assert any("is known to 6 % only" in what for what in found) == is_problem
 
 
 def test_the_table_of_exit_code_1_is_that_of_the_code() -> None:
