@@ -13,6 +13,9 @@ from loaded_script import script
 import reseau
 
 DOCS = Path(__file__).parents[1] / "docs"
+PAGES_OF_THE_DEMONSTRATION = (
+    "start/film-scan.md", "how-to/plan-a-network.md", "how-to/choose-a-model.md", "notebooks/film-scan.ipynb"
+)  # fmt: skip
 MKDOCS = DOCS.parent / ".venv-docs" / "bin" / "mkdocs"
 
 
@@ -67,6 +70,24 @@ def test_the_matrices_of_the_figures(name: str, shape: tuple[int, int], filled: 
     if name == "N":
         assert (abs(matrix - matrix.T) <= 1e-9 * abs(matrix).max()).all()
     assert (DOCS / f"figure-{'ABN'.index(name) + 1}-{name}.png").stat().st_size < 150_000
+
+
+def test_the_figures_of_the_demonstration_are_those_of_one_run() -> None:
+    """demo.json and the picture by docs/make_pictures.py, the notebook by docs/run_notebooks.py, two tables, a plan."""
+    made = json.loads((DOCS / "demo.json").read_text(encoding="utf-8"))
+    c, sigma, sigma0 = made["c_mm"], made["c_sigma_mm"], made["sigma0"]
+    texts = {name: (DOCS / name).read_text(encoding="utf-8") for name in PAGES_OF_THE_DEMONSTRATION}
+    assert f"c {c:.4f}, sigma0 {sigma0:.3f}".encode() in (DOCS / "report.png").read_bytes()
+    assert f"c = {c:.3f} mm, with a standard deviation of {sigma:.3f}" in texts["start/film-scan.md"]
+    assert f"Here it is {sigma0:.2f}." in texts["start/film-scan.md"]
+    assert f"gets c to {sigma:.4f} mm" in texts["how-to/plan-a-network.md"]
+    row = re.search(r"^\| \*\*affine, torlegard.*$", texts["how-to/choose-a-model.md"], re.MULTILINE)
+    assert row
+    assert f"| {made['redundancy']} | {sigma0:.2f} | {sigma0**2 * made['redundancy']:.1f} |" in row[0]
+    assert f"redundancy {made['redundancy']}, sigma0 {sigma0:.3f})" in texts["notebooks/film-scan.ipynb"]
+    shown = re.search(r"<td>c of camera metric 6 x 6</td><td>([\d.]+)</td>", texts["notebooks/film-scan.ipynb"])
+    assert shown
+    assert float(shown[1]) == pytest.approx(c, abs=0.1 * sigma)  # its disks are not corrected for eccentricity
 
 
 def test_every_module_stands_on_the_map_of_the_code_with_its_own_words() -> None:

@@ -1,0 +1,164 @@
+"""The pictures of the pages, taken with Chromium, and the figures of the demonstration that pages quote.
+
+python docs/make_pictures.py FOLDER [report] [review] [learn] [draw]: all of them without a name. What they show is made
+in the folder, and used again where it is there: `demo` by `reseau demo`, `archive` with the planted faults of
+benchmarks/review_faults.py.
+"""
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from PIL import Image, PngImagePlugin
+from playwright.sync_api import Page, expect
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from browser import started_browser
+
+from benchmarks import review_faults
+from benchmarks.harness import reseau
+from benchmarks.review_load import served_page
+from pipeline.results.adjustment_file import read_adjustment
+
+DOCS = Path(__file__).parent
+FRAMES = 20  # of the archive: one with each fault
+SMALL = {"width": 800, "height": 1250}
+LARGE = {"width": 1300, "height": 1000}
+LEARNED = "".join(
+    f'[[fiducial]]\nid = "{n}"\nxy_mm = [{x}, {y}]\nmark = "m"\n' for n, (x, y) in review_faults.PLACES.items()
+)
+
+
+def report(folder: Path) -> None:
+    """report.png, with the figures that it shows as a comment, and demo.json: these figures."""
+    demo = folder / "demo"
+    if not (demo / "out" / "report.html").exists():
+        reseau("demo", demo)
+    adjustment = read_adjustment(demo / "out" / "adjustment.json")
+    (camera,) = adjustment.cameras.values()
+    c = camera.principal_distance_mm
+    figures = {"c_mm": c.value, "c_sigma_mm": c.sigma, "sigma0": adjustment.sigma0, "redundancy": adjustment.redundancy}
+    (DOCS / "demo.json").write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    with started_browser() as browser:
+        page = browser.new_page(viewport={"width": 1300, "height": 1190})
+        page.goto((demo / "out" / "report.html").as_uri())
+        page.screenshot(path=DOCS / "report.png")
+    comment = PngImagePlugin.PngInfo()
+    comment.add_text("Comment", f"c {c.value:.4f}, sigma0 {adjustment.sigma0:.3f}")
+    with Image.open(DOCS / "report.png") as picture:
+        picture.load()
+    picture.save(DOCS / "report.png", pnginfo=comment, optimize=True)
+
+
+def archive(folder: Path) -> tuple[Path, Mapping[str, review_faults.Truth]]:
+    """The measured project with faults, and its true values."""
+    review_faults.FRAMES = FRAMES
+    truths = review_faults.planted(folder / "archive", np.random.default_rng(1))
+    project = folder / "archive" / "project.toml"
+    reseau("measure", project)
+    return project, truths
+
+
+@contextmanager
+def shown(project: Path, size: dict[str, int], scheme: Literal["light", "dark"]) -> Iterator[Page]:
+    """The review page of a project."""
+    with served_page(project) as (page, address, _):
+        page.set_viewport_size({"width": size["width"], "height": size["height"]})
+        page.emulate_media(color_scheme=scheme)
+        page.goto(address)
+        page.wait_for_function("document.getElementById('left').textContent !== '…'")
+        yield page
+
+
+def review(folder: Path) -> None:
+    """review-pose.png, review-mark.png and review-frame.png."""
+    project, truths = archive(folder)
+    with shown(project, LARGE, "dark") as page:
+        page.locator("#queue button", has_text="how it lies").first.click()
+        expect(page.locator("#poses button").first).to_be_visible()
+        _take(page, "review-pose")
+    stamped = next(name for name in truths if _fault(name, truths) == "stamp")
+    with shown(project, LARGE, "light") as page:
+        page.locator("#queue button", has_text=f"{stamped}: fiducial").first.click()
+        expect(page.locator("#mark-view")).to_be_visible()
+        _take(page, "review-mark")
+    with shown(project, SMALL, "dark") as page:
+        page.locator("#queue button", has_text="no mark was found").first.click()
+        image = page.inner_text("#title").partition(":")[0]
+        _click_marks(page, truths[image], "124")
+        _take(page, "review-frame")
+
+
+def _fault(name: str, truths: Mapping[str, review_faults.Truth]) -> str:
+    """The kind of fault that `planted` gave a frame."""
+    order: list[int] = np.random.default_rng(1).permutation(FRAMES)[: len(review_faults.FAULTS)].tolist()
+    kinds = dict(zip(order, review_faults.FAULTS, strict=True))
+    return kinds[list(truths).index(name)].kind
+
+
+def learn(folder: Path) -> None:
+    """review-learn.png: marks that nobody has drawn, clicked in one scan."""
+    project, truths = archive(folder)
+    text = f'name = "K"\nframe_mm = [16.0, 16.0]\n{LEARNED}[mark.m]\nkind = "learned"\nsize_mm = 2.2\n'
+    project.with_name("camera.toml").write_text(text, encoding="utf-8")
+    with shown(project, SMALL, "light") as page:
+        page.locator("#queue button").first.click()
+        _click_marks(page, truths[page.locator("#scan").input_value()], "12345678")
+        _take(page, "review-learn")
+
+
+def _click_marks(page: Page, truth: review_faults.Truth, numbers: str) -> None:
+    """Click marks by keys, and measure by them."""
+    person = review_faults.Person(page, {}, review_faults.Session())
+    expect(page.locator("#whole")).to_be_focused()
+    for number in numbers:
+        page.keyboard.press(number)
+        for view in ("whole", "near"):
+            expect(page.locator(f"#{view}")).to_be_focused()
+            person.steers(view, truth.px[number])
+            page.keyboard.press("Enter")
+    page.keyboard.press("m")
+    page.wait_for_selector("#keep:focus", timeout=300_000)
+
+
+def draw(folder: Path) -> None:
+    """draw-camera.png: a ring-cross whose ring line is still too wide."""
+    project, truths = archive(folder)
+    project.with_name("camera.toml").unlink()
+    sizes = {"arm_mm": 0.8, "line_mm": 0.1, "ring_mm": 0.5, "ring_line_mm": 0.13, "gap_mm": 0.0}
+    with shown(project, {"width": 992, "height": 952}, "light") as page:
+        expect(page.locator("#draw-view")).to_be_visible()
+        scan = page.locator("#draw-scan").input_value()
+        with Image.open(project.parent / "scans" / f"{scan}.tif") as picture:
+            width = picture.width
+        box = page.locator("#draw-whole").bounding_box()
+        assert box is not None
+        for number in "1234":
+            x, y = (truths[scan].px[number] + 0.5) * box["width"] / width
+            page.locator("#draw-whole").click(position={"x": float(x), "y": float(y)})
+        page.locator("#draw-kind").select_option("ring-cross")
+        for key, value in sizes.items():
+            page.locator(f"#size-{key}").fill(str(value))
+            page.locator(f"#size-{key}").press("Enter")
+        page.wait_for_function("document.getElementById('draw-left').dataset.shown")
+        _take(page, "draw-camera")
+
+
+def _take(page: Page, name: str) -> None:
+    page.wait_for_load_state("networkidle")
+    page.wait_for_timeout(2000)
+    page.screenshot(path=DOCS / f"{name}.png")
+
+
+PICTURES: dict[str, Callable[[Path], None]] = {"report": report, "review": review, "learn": learn, "draw": draw}
+
+
+if __name__ == "__main__":
+    place = Path(sys.argv[1]).resolve()
+    for each in sys.argv[2:] or PICTURES:
+        PICTURES[each](place)
