@@ -330,9 +330,8 @@ def _draw_points(path: Path, swept: Swept) -> None:
     counts = np.array([float(step.value) for step in swept.steps])
     axes = _draw(counts, {name: [step.sigmas.mean[name] for step in swept.steps] for name in PAPER_UM})
     first = swept.steps[0].sigmas.mean["t1"]
-    for slope, style, whose in ((-0.5, ":", "uncorrelated points"), (-0.62, "--", "printed by Juhl")):
-        line = 1.8 * first * (counts / counts[0]) ** slope
-        axes.plot(counts, line, style, color="0.5", label=f"slope {slope}, {whose}")
+    for slope, style, whose in ((-0.5, ":", "slope"), (-0.62, "--", "Juhl's slope")):
+        axes.plot(counts, 1.8 * first * (counts / counts[0]) ** slope, style, color="0.5", label=f"{whose} {slope}")
     axes.set(xscale="log", yscale="log", xlabel="number of points")
     for axis, places in ((axes.xaxis, counts), (axes.yaxis, np.array([0.3, 0.5, 1.0, 2.0, 3.0]))):
         axis.set_ticks(places, [f"{place:g}" for place in places])

@@ -262,7 +262,7 @@ class Person:
         self.page.wait_for_function(_READY)
         image, _, requests = self.page.inner_text("#title").partition(": ")
         truth = self.truths[image.split(" and ")[0]]
-        if requests == "how it lies":
+        if requests == "scan orientation":
             self.press(str(POSES.index(truth.pose) + 1), "pose")
         elif requests == "no mark was found":
             self.shows_frame(truth)

@@ -79,7 +79,7 @@ def review(folder: Path) -> None:
     """review-pose.png, review-mark.png and review-frame.png."""
     project, truths = archive(folder)
     with shown(project, LARGE, "dark") as page:
-        page.locator("#queue button", has_text="how it lies").first.click()
+        page.locator("#queue button", has_text="scan orientation").first.click()
         expect(page.locator("#poses button").first).to_be_visible()
         _take(page, "review-pose")
     stamped = next(name for name in truths if _fault(name, truths) == "stamp")
