@@ -147,7 +147,7 @@ class Cause(MeaningfulWord):
     SECOND_METHOD = "second method", "Disagreement with the position from its edges."
     GIVEN_PLACES = "given places", "Disagreement with the given coordinates."
     OTHER_FRAMES = "other frames", "Disagreement with the camera's other frames."
-    INTERPOLATION = "interpolation", "Interpolation between the pixels of two scans."
+    INTERPOLATION = "interpolation", "Interpolation between two scans, or none: nearest neighbours."
     CLICK = "click", "A person pointed at it, and nothing could be matched there."
     LENS = "taking lens", "Uncertainty of the lens that photographed the film, from its calibration."
 

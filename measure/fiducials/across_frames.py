@@ -203,7 +203,6 @@ class Explanation:
 
     @property
     def is_quiet(self) -> bool:
-        """Whether there is no outlier."""
         return not (self.film_is_more or any(each.film_mm or each.off_mm.any() for each in self.frames.values()))
 
     @property
@@ -362,7 +361,6 @@ def _doubt(mark: MarkMeasurement, cause: Cause, variance_px2: float, reason: Rea
 
 
 def _replace_marks(frame: FrameMeasurement, changed: Mapping[str, MarkMeasurement]) -> FrameMeasurement:
-    """Replace some fiducials, by name."""
     marks = (changed.get(mark.point, mark) if mark.kind == "fiducial" else mark for mark in frame.marks)
     return replace(frame, marks=tuple(marks))
 

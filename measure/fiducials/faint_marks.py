@@ -365,7 +365,6 @@ class _Response:
 
     @cached_property
     def template(self) -> Array:
-        """Template of the mark at this phase."""
         return self.field.template(self.fraction)
 
     @cached_property

@@ -334,7 +334,6 @@ def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape, sig
 
 
 def _radius_mm(mark: Mark) -> float:
-    """Radius of the outline of a round mark."""
     parts = mark.parts if isinstance(mark, MarkShape) else ()
     return max(part.radius_mm for part in parts if isinstance(part, Disk | Ring))
 

@@ -10,9 +10,10 @@ from measure.array_types import Array
 from measure.fiducials.frame import Frame
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA
 from measure.fiducials.mark_fit import Detection
-from measure.flags import NO_REASON, RIGHT_PITCH_REFUSED, Code, Reason, Status
+from measure.flags import NO_REASON, RIGHT_PITCH_REFUSED, Cause, Code, Reason, Status
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkTemplate, finest_detail_mm
 from measure.matching.covariance import honest_covariance
+from measure.noise.resampling import NEAREST_PX2, is_nearest_neighbour
 from measure.results import FrameMeasurement, MarkMeasurement, Pose
 from measure.scans.scan import Scan
 
@@ -21,6 +22,11 @@ _REACH_PX = 20.0  # around a mark of unknown size: that of a disk or crossing of
 _PLAIN_PX = 3.0  # px across the finest line of a mark: both edges and the inside are resolved
 _ASSUMED = Reason(
     "the scan orientation is only assumed, and another of the learned marks would have its origin elsewhere", Code.POSE
+)
+_NEAREST = Reason(
+    "The scan was turned or enlarged with nearest neighbours: each of its marks may lie half a pixel off. Measure the "
+    "scan that it was made from, or turn that with interpolation.",
+    Code.IMPRECISE,
 )
 _OWN = Reason("its template is its own picture: nothing checks its place", Code.OWN_PICTURE)
 
@@ -67,7 +73,6 @@ def absent_frame(
 
 
 def _too_coarse(layout: FiducialLayout, pitch_um: float) -> Reason:
-    """Warn if the pixels are too large for the marks' finest detail; empty otherwise."""
     finest_um = 1000 * min(finest_detail_mm(mark.mark) for mark in layout.marks)
     if finest_um >= _PLAIN_PX * pitch_um:
         return NO_REASON
@@ -102,6 +107,9 @@ def present_frame(
         places = zip(frame.layout.marks, frame.detections, frame.predicted_px, strict=True)
         marks = tuple(_unmeasured(mark.id, each, place, chance) for mark, each, place in places)
         return FrameMeasurement(frame.scan.name, marks, pose, problems=tuple(problems), weights=frame.weights)
+    if is_nearest_neighbour(frame.scan):
+        detections = (each.amend(parts={Cause.INTERPOLATION: NEAREST_PX2}) for each in frame.detections)
+        frame, problems = replace(frame, detections=tuple(detections)), (*problems, _NEAREST)
     unnamed = next((problem for problem in problems if Code.AMBIGUOUS in problem.codes), NO_REASON)
     marks = tuple(_row(mark, index, frame, pose, chance, unnamed) for index, mark in enumerate(frame.layout.marks))
     problems = (*problems, *_problems(frame, pitch_um))
@@ -112,7 +120,6 @@ def present_frame(
 
 
 def _unmeasured(point: str, detection: Detection, place_px: Array, why: Reason) -> MarkMeasurement:
-    """Row of a mark without a measurement: predicted, or absent outside of the scan."""
     if detection.inside:
         return MarkMeasurement(point, "fiducial", place_px, None, Status.PREDICTED, why)
     return MarkMeasurement(point, "fiducial", None, None, Status.ABSENT, detection.reason)

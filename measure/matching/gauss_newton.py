@@ -140,7 +140,6 @@ class PictureFit:
 
     @property
     def state(self) -> State:
-        """State of the model."""
         return self.model.state
 
     @state.setter
@@ -324,7 +323,6 @@ class PictureFit:
 
     @property
     def contrast_dn(self) -> float:
-        """Absolute contrast of the mark."""
         return abs(self.model.contrast_dn)
 
     @property

@@ -98,7 +98,7 @@ def test_a_pose_of_the_user_that_the_picture_contradicts_is_reported() -> None:
     result = draw.measure_grey(draw.frame_picture(draw.NUMBERED, matrix), draw.NUMBERED, FiducialOptions(pose="0"))
     assert draw.found_pose(result) == ("0", True)
     assert any(
-        "pose 0 is set in the project, but the marks of this frame show 90m" in problem
+        "scan orientation 0 is set in the project, but the marks of this frame show 90m" in problem
         and "identification dots" in problem
         for problem in result.problems
     )
