@@ -27,6 +27,8 @@ from pipeline.results.adjustment_file import read_adjustment
 
 DOCS = Path(__file__).parent
 FRAMES = 20  # of the archive: one with each fault
+SETTLED_MS = 10_000  # until all images on the review page are there
+COLOURS = 128
 SMALL = {"width": 800, "height": 1250}
 LARGE = {"width": 1300, "height": 1000}
 LEARNED = "".join(
@@ -79,12 +81,11 @@ def review(folder: Path) -> None:
     """review-pose.png, review-mark.png and review-frame.png."""
     project, truths = archive(folder)
     with shown(project, LARGE, "dark") as page:
-        page.locator("#queue button", has_text="scan orientation").first.click()
+        page.locator("#queue button", has_text=f"{_frame(truths, 'pose hidden')}: scan orientation").first.click()
         expect(page.locator("#poses button").first).to_be_visible()
         _take(page, "review-pose")
-    stamped = next(name for name in truths if _fault(name, truths) == "stamp")
     with shown(project, LARGE, "light") as page:
-        page.locator("#queue button", has_text=f"{stamped}: fiducial").first.click()
+        page.locator("#queue button", has_text=f"{_frame(truths, 'stamp')}: fiducial").first.click()
         expect(page.locator("#mark-view")).to_be_visible()
         _take(page, "review-mark")
     with shown(project, SMALL, "dark") as page:
@@ -94,11 +95,11 @@ def review(folder: Path) -> None:
         _take(page, "review-frame")
 
 
-def _fault(name: str, truths: Mapping[str, review_faults.Truth]) -> str:
-    """The kind of fault that `planted` gave a frame."""
-    order: list[int] = np.random.default_rng(1).permutation(FRAMES)[: len(review_faults.FAULTS)].tolist()
-    kinds = dict(zip(order, review_faults.FAULTS, strict=True))
-    return kinds[list(truths).index(name)].kind
+def _frame(truths: Mapping[str, review_faults.Truth], kind: str) -> str:
+    """The first frame in which `planted` put a fault of a kind."""
+    order: list[int] = np.random.default_rng(1).permutation(FRAMES).tolist()
+    kinds = dict(zip(order, (fault.kind for fault in review_faults.FAULTS), strict=True))
+    return next(name for number, name in enumerate(sorted(truths)) if kinds[number] == kind)
 
 
 def learn(folder: Path) -> None:
@@ -150,9 +151,14 @@ def draw(folder: Path) -> None:
 
 
 def _take(page: Page, name: str) -> None:
-    page.wait_for_load_state("networkidle")
-    page.wait_for_timeout(2000)
-    page.screenshot(path=DOCS / f"{name}.png")
+    """Write a picture of what the window shows from its top on, in few colours."""
+    page.evaluate("window.scrollTo(0, 0)")
+    page.wait_for_timeout(SETTLED_MS)
+    path = DOCS / f"{name}.png"
+    page.screenshot(path=path)
+    with Image.open(path) as picture:
+        few = picture.convert("RGB").quantize(COLOURS)
+    few.save(path, optimize=True)
 
 
 PICTURES: dict[str, Callable[[Path], None]] = {"report": report, "review": review, "learn": learn, "draw": draw}
