@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from test_lens_comparison import make_calibration, noisy, set_calibration, two_networks
+from test_lens_families import make_calibration, noisy, set_calibration, two_networks
 
 from adjust import Parameter, adjust
 from adjust.functional_model.lens import Distortion, Lens

@@ -30,11 +30,11 @@ FORM_SPREAD, CONTRAST_SPREAD, DISK_BLUR_SPREAD, DISK_OFF_PX = 0.02, 0.05, 0.1, 0
 
 @dataclass(frozen=True, eq=False)
 class DustyMark:
-    """Mark with dust. grey: (size, size) window; seen: mask of pixels without specks; found: None if not measured."""
+    """Mark with dust. grey: (size, size) window; visible: pixels without specks; found: None if not measured."""
 
     mark: TrueMark
     grey: Array
-    seen: Mask
+    visible: Mask
     found: Found | None
 
     @property

@@ -14,7 +14,7 @@ from adjust.problem.network import Approximations, Image, Network, ObjectPoint
 from adjust.problem.observations import Observations
 
 Array = NDArray[np.float64]
-Seen = tuple[NDArray[np.intp], Array]  # of an image: indices of points, and their places (m, 2), mm, y up
+VisiblePoints = tuple[NDArray[np.intp], Array]  # of an image: indices of points, and their places (m, 2), mm, y up
 
 SIGMA_MM = 0.005
 FOCAL_MM, FRAME_MM = 100.0, 200.0
@@ -28,13 +28,13 @@ POINTS_AN_IMAGE, CONTROL_EVERY = 50, 10  # of a strip: points per image, images 
 class Scene:
     """Network to adjust, with its data for other programs.
 
-    points: (p, 3); seen: by image, indices of the points and their places (m, 2), mm, y up.
+    points: (p, 3); visible: by image, indices of the points and their places (m, 2), mm, y up.
     """
 
     network: Network
     start: Approximations
     points: Array
-    seen: list[Seen]
+    visible: list[VisiblePoints]
 
 
 def make_board(views: int, relief: float = 0.05) -> Scene:
@@ -104,7 +104,7 @@ def _scene(
     return Scene(network, start, points, projected)
 
 
-def _projected(rng: np.random.Generator, points: Array, stations: Array, angles: Array) -> list[Seen]:
+def _projected(rng: np.random.Generator, points: Array, stations: Array, angles: Array) -> list[VisiblePoints]:
     """Project the points into each image; points in fewer than two images are left out."""
     matrix = np.diag([FOCAL_MM, FOCAL_MM, 1.0])
     lens = np.array([TRUE["k1"], TRUE["k2"], 0.0, 0.0, 0.0])
@@ -121,9 +121,9 @@ def _projected(rng: np.random.Generator, points: Array, stations: Array, angles:
     return [(inside[rays[inside] > 1], places[rays[inside] > 1]) for inside, places in view]
 
 
-def _network(points: Array, sigma: Array, estimated: Sequence[str], seen: Sequence[Seen]) -> Network:
+def _network(points: Array, sigma: Array, estimated: Sequence[str], visible: Sequence[VisiblePoints]) -> Network:
     """Network with points of sigma 0 known; the other points, the camera and the estimated distortion are free."""
-    names = [f"i{i}" for i in range(len(seen))]
+    names = [f"i{i}" for i in range(len(visible))]
     free = {name: Prior(0.0, np.inf) for name in estimated}
     free_point = Prior(FOCAL_MM, np.inf), Prior(0.0, np.inf), Prior(0.0, np.inf)
     return Network(
@@ -134,10 +134,10 @@ def _network(points: Array, sigma: Array, estimated: Sequence[str], seen: Sequen
             for i, (xyz, s) in enumerate(zip(points, sigma, strict=True))
         ),
         Observations(
-            tuple(name for name, (inside, _) in zip(names, seen, strict=True) for _ in inside),
-            tuple(str(i) for inside, _ in seen for i in inside),
-            tuple("target" for inside, _ in seen for _ in inside),
-            np.concatenate([places for _, places in seen]),
-            np.tile(SIGMA_MM**2 * np.eye(2), (sum(len(inside) for inside, _ in seen), 1, 1)),
+            tuple(name for name, (inside, _) in zip(names, visible, strict=True) for _ in inside),
+            tuple(str(i) for inside, _ in visible for i in inside),
+            tuple("target" for inside, _ in visible for _ in inside),
+            np.concatenate([places for _, places in visible]),
+            np.tile(SIGMA_MM**2 * np.eye(2), (sum(len(inside) for inside, _ in visible), 1, 1)),
         ),
     )

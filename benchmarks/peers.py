@@ -87,8 +87,8 @@ def report(rows: Sequence[Row]) -> Iterator[str]:
         by_program: dict[str, list[Row]] = {}
         for row in own:
             by_program.setdefault(row["program"], []).append(row)
-        told = (f"{program} {_describe(figures)}" for program, figures in by_program.items())
-        yield f"{' '.join(str(each) for each in network if each is not None)}: {', '.join(told)}"
+        programs = (f"{program} {_describe(figures)}" for program, figures in by_program.items())
+        yield f"{' '.join(str(each) for each in network if each is not None)}: {', '.join(programs)}"
 
 
 NETWORK = ("table", "images", "points", "shape", "c", "percent")
@@ -119,9 +119,9 @@ def spoilt(scene: Scene, percent: int) -> Scene:
     rows = rng.permutation(len(xy_mm))[: len(xy_mm) * percent // 100]
     xy_mm[rows] += rng.uniform(-GROSS_MM, GROSS_MM, (len(rows), 2))
     network = replace(scene.network, observations=replace(scene.network.observations, xy_mm=xy_mm))
-    ends = np.cumsum([len(inside) for inside, _ in scene.seen])[:-1]
-    view = [(inside, xy) for (inside, _), xy in zip(scene.seen, np.split(xy_mm, ends), strict=True)]
-    return replace(scene, network=network, seen=view)
+    ends = np.cumsum([len(inside) for inside, _ in scene.visible])[:-1]
+    view = [(inside, xy) for (inside, _), xy in zip(scene.visible, np.split(xy_mm, ends), strict=True)]
+    return replace(scene, network=network, visible=view)
 
 
 Found = tuple[float, float]  # c, mm, and CPU seconds
@@ -152,7 +152,7 @@ def colmap(scene: Scene, relief: bool, given: bool, gross: bool) -> Found:
     resection = pycolmap.AbsolutePoseEstimationOptions(estimate_focal_length=not given)
     resection.ransac.random_seed = 1
     tracks: dict[int, Any] = {}
-    for number, ((inside, _), places) in enumerate(zip(scene.seen, pixels_of_images(scene), strict=True), 1):
+    for number, ((inside, _), places) in enumerate(zip(scene.visible, pixels_of_images(scene), strict=True), 1):
         own = pycolmap.Camera(model="OPENCV", width=size, height=size, params=camera.params)
         refinement = pycolmap.AbsolutePoseRefinementOptions(refine_focal_length=not given)
         pose = pycolmap.estimate_and_refine_absolute_pose(places, scene.points[inside], own, resection, refinement)
@@ -209,8 +209,8 @@ print(json.dumps([float(intrinsics[0, :2].mean()), time.process_time() - begin])
 
 def mrcal(scene: Scene, relief: bool, given: bool, gross: bool) -> Found:
     """Run mrcal in a process of the system's interpreter."""
-    observations = np.full((len(scene.seen), 100, 3), -1.0)
-    for of_view, (inside, _), places in zip(observations, scene.seen, pixels_of_images(scene), strict=True):
+    observations = np.full((len(scene.visible), 100, 3), -1.0)
+    for of_view, (inside, _), places in zip(observations, scene.visible, pixels_of_images(scene), strict=True):
         of_view[inside] = np.column_stack([places, np.ones(len(places))])
     size, c = FRAME_MM * PIXELS_PER_MM, FOCAL_MM * PIXELS_PER_MM * (OFF if given else GUESS)
     with TemporaryDirectory() as folder:

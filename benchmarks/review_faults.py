@@ -97,11 +97,11 @@ FAULTS = (
 
 @dataclass(frozen=True)
 class Truth:
-    """True values of a frame. px: place of each mark by name; seen: names of the visible marks."""
+    """True values of a frame. px: place of each mark by name; visible: names of the visible marks."""
 
     pose: str
     px: Mapping[str, Array]
-    seen: frozenset[str]
+    visible: frozenset[str]
 
 
 @dataclass
@@ -151,8 +151,8 @@ def report(rows: Sequence[Row]) -> Iterator[str]:
 def is_right(row: Mapping[str, str], truth: Truth) -> bool:
     """Whether a visible mark is measured at its place, or an invisible one is not an observation."""
     is_observation = row["status"] in ("measured", "weak")
-    if row["point"] not in truth.seen or not is_observation:
-        return is_observation == (row["point"] in truth.seen)
+    if row["point"] not in truth.visible or not is_observation:
+        return is_observation == (row["point"] in truth.visible)
     off_px = float(np.hypot(*(np.array([float(row["col_px"]), float(row["row_px"])]) - truth.px[row["point"]])))
     sigma_px = 1000.0 / PITCH_UM * max(float(row["sx_mm"]), float(row["sy_mm"]))
     return off_px < (RIGHT_PX if row["status"] == "measured" else max(RIGHT_PX, 4 * sigma_px))
@@ -274,9 +274,9 @@ class Person:
 
     def judges(self, point: str, truth: Truth) -> None:
         measured, place = self.page.evaluate(_SHOWN), truth.px[point]
-        if measured and point in truth.seen and np.hypot(*(np.array(measured) - place)) < SEEN_PX:
+        if measured and point in truth.visible and np.hypot(*(np.array(measured) - place)) < SEEN_PX:
             self.press("a", "accept")
-        elif point in truth.seen:
+        elif point in truth.visible:
             self.steers("mark", place)
             self.press("Enter", "place")
         else:

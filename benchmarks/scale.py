@@ -150,7 +150,7 @@ def opencv(scene: Scene, free: bool, flat: bool) -> Figures:
     """Measure OpenCV's calibration with its standard deviations. free: without a principal distance, or with a wrong
     one for points in relief, which require one."""
     cv2.setNumThreads(1)
-    model = [scene.points[inside].astype(np.float32) for inside, _ in scene.seen]
+    model = [scene.points[inside].astype(np.float32) for inside, _ in scene.visible]
     imaged = [pixels.astype(np.float32) for pixels in pixels_of_images(scene)]
     size, c = int(PIXELS_PER_MM * FRAME_MM), PIXELS_PER_MM * FOCAL_MM * (GUESS if free else OFF)
     start = np.array([[c, 0.0, size / 2], [0.0, c, size / 2], [0.0, 0.0, 1.0]])
@@ -164,7 +164,7 @@ def opencv(scene: Scene, free: bool, flat: bool) -> Figures:
 
 def pixels_of_images(scene: Scene) -> list[Array]:
     """Pixel coordinates (m, 2) of the marks of each image, y down."""
-    return [(places * (1.0, -1.0) + FRAME_MM / 2) * PIXELS_PER_MM for _, places in scene.seen]
+    return [(places * (1.0, -1.0) + FRAME_MM / 2) * PIXELS_PER_MM for _, places in scene.visible]
 
 
 class SparseProblem:
@@ -244,7 +244,7 @@ def ceres(scene: Scene) -> Figures:
     )
     config = pycolmap.BundleAdjustmentConfig()
     tracks: dict[int, Any] = {}
-    for number_, (image, (inside, places)) in enumerate(zip(scene.network.images, scene.seen, strict=True), 1):
+    for number_, (image, (inside, places)) in enumerate(zip(scene.network.images, scene.visible, strict=True), 1):
         start = scene.start.exterior[image.name]
         rotation = FLIP @ rotation_from_angles(start[3:])
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ start[:3])

@@ -16,9 +16,9 @@ from skimage.measure import EllipseModel, find_contours, label, ransac, regionpr
 from skimage.morphology import opening
 from skimage.registration import phase_cross_correlation
 from skimage.transform import AffineTransform, PiecewiseAffineTransform, PolynomialTransform
-from test_corners import NOISE as CORNER_NOISE
-from test_corners import SIZE as CORNER_PX
-from test_corners import board_steps, square_picture
+from test_frame_edge import CORNER_SIZE as CORNER_PX
+from test_frame_edge import NOISE as CORNER_NOISE
+from test_frame_edge import board_steps, square_picture
 from test_targets import field
 from true_marks import KIND, TrueMark, some_mark
 
@@ -92,10 +92,10 @@ def blobs(_: int) -> str:
     drawn_field, centers = field(np.random.default_rng(SEED), DISKS)
     truth = np.array(centers)
     fainter = drawn_field.mean() + (drawn_field - drawn_field.mean()) / 3
-    return " || ".join(_first_looks(picture, truth) for picture in (drawn_field, fainter))
+    return " || ".join(_places_found(picture, truth) for picture in (drawn_field, fainter))
 
 
-def _first_looks(picture: Array, truth: Array) -> str:
+def _places_found(picture: Array, truth: Array) -> str:
     def regions() -> Array:
         """Regions above multiples of the image noise; of those around one place the one of largest solidity."""
         above = picture - threshold_local(picture, 4 * int(RADII_PX[1]) + 1, method="mean")
@@ -137,10 +137,10 @@ def agreeing_marks(count: int) -> str:
     """Outlier detection on a film with deformation of about 0.1 mm, with gross errors of 1 mm in two of eight or none
     of four marks: number of frames in which exactly these are rejected, and in which a correct mark is, by RANSAC with
     the gate of the search, and one by one."""
-    return " || ".join(_outliers_told(10 * count, *case) for case in ((MARKS_MM, 2), (MARKS_MM[:4], 0)))
+    return " || ".join(_outliers_named(10 * count, *case) for case in ((MARKS_MM, 2), (MARKS_MM[:4], 0)))
 
 
-def _outliers_told(frames: int, marks_mm: Array, off: int) -> str:
+def _outliers_named(frames: int, marks_mm: Array, off: int) -> str:
     rng, result = np.random.default_rng(SEED), {"RANSAC": [0, 0], "one by one": [0, 0]}
     for number in range(frames):
         x, y = marks_mm.T / 106.0

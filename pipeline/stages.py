@@ -30,14 +30,8 @@ from pipeline.publishing import Unpublished, unpublished
 from pipeline.report.data import ReportData
 from pipeline.report.load import adjusted_data, frame_data, measured_data, report_data
 from pipeline.report.page import write_frame_page, write_report
+from pipeline.results import comparator_file
 from pipeline.results.adjustment_file import covariance_path, read_adjustment, write_adjustment
-from pipeline.results.comparator_file import (
-    ComparatorPoint,
-    read_comparator,
-    read_measurement_hash,
-    read_pitches,
-    write_comparator,
-)
 from pipeline.results.measured_record import MeasuredScan, for_images, write_frames
 from pipeline.results.record_json import write_record
 from pipeline.summary import Summary, archive_summary, shard_summary, summarise
@@ -243,9 +237,9 @@ class _Run:
             self._write_marks(before.rejudge(again))
         return adjust_marks(project, self.marks())
 
-    def marks(self) -> tuple[ComparatorPoint, ...]:
+    def marks(self) -> tuple[comparator_file.ComparatorPoint, ...]:
         """Marks of comparator.csv, from this command, an earlier one or the user."""
-        return read_comparator(self.comparator(), self.project.list_pitch_um)
+        return comparator_file.read_comparator(self.comparator(), self.project.list_pitch_um)
 
     def comparator(self) -> Path:
         """Path of comparator.csv. Raises InputError where it does not exist."""
@@ -261,7 +255,7 @@ class _Run:
         """Judging that comparator.csv names; None where it is not from the results database."""
         project = self.project
         return stored_judging(
-            project.measurement_path, read_measurement_hash(self.new.current_path(project.comparator))
+            project.measurement_path, comparator_file.read_measurement_hash(self.new.current_path(project.comparator))
         )
 
     def _write_marks(self, judging: Judging) -> None:
@@ -271,7 +265,7 @@ class _Run:
                 who = camera.path.name, camera.clicks.who
                 decisions[who] = decisions.get(who, 0) + 1
         place = new.place(project.comparator)
-        write_comparator(place, judging.points(), judging.pitches_um(), judging.digest, decisions)
+        comparator_file.write_comparator(place, judging.points(), judging.pitches_um(), judging.digest, decisions)
         if not write_frames(new.place(project.frames_path), judging.written_scans()):
             new.remove(project.frames_path)
 
@@ -290,7 +284,7 @@ class _Run:
         if self.project.images_path is not None:
             fill_images(self.project.images_path, for_images(scans, WRITTEN))
 
-    def write_adjustment(self, adjustment: Adjustment, marks: Sequence[ComparatorPoint]) -> None:
+    def write_adjustment(self, adjustment: Adjustment, marks: Sequence[comparator_file.ComparatorPoint]) -> None:
         made_from = adjusted_from(self.project, marks)
         write_adjustment(adjustment, self.new.place(self.project.adjustment_path), made_from, self._frames_mm())
 
@@ -323,7 +317,7 @@ class _Run:
         board = project.targets.board if project.targets else None
         if board is None or not project.scans or not detector_name(board):
             return None
-        pitch_um = read_pitches(self.new.current_path(project.comparator))
+        pitch_um = comparator_file.read_pitches(self.new.current_path(project.comparator))
         if project.pitch_um:
             pitch_um = dict.fromkeys(project.scans, project.pitch_um) | pitch_um
         images = project.given_images.turned_deg if project.given_images else {}

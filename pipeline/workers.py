@@ -9,15 +9,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    ThreadPoolExecutor,
-    wait,
-)
+from concurrent import futures
+from concurrent.futures import wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -54,7 +47,7 @@ Task = TypeVar("Task")
 Made = TypeVar("Made")
 
 
-class WorkerKilled(BrokenExecutor):
+class WorkerKilled(futures.BrokenExecutor):
     """The process of a task was killed on each attempt."""
 
     def __init__(self) -> None:
@@ -62,7 +55,7 @@ class WorkerKilled(BrokenExecutor):
 
 
 @contextmanager
-def worker_pool(scans: int, workers: int | None = None) -> Iterator[Executor]:
+def worker_pool(scans: int, workers: int | None = None) -> Iterator[futures.Executor]:
     """Pool of single-threaded processes, one per core or `workers`.
 
     Each scan is measured by one process, so the result does not depend on their number. If the block ends early, the
@@ -98,7 +91,7 @@ class ScriptlessContext(SpawnContext):
     Process = ScriptlessProcess
 
 
-class LocalPool(ThreadPoolExecutor):
+class LocalPool(futures.ThreadPoolExecutor):
     """Threads with a process each, which get one task at a time.
 
     It is therefore known which task a killed process had: only that one is repeated, in a new process, and given up
@@ -108,10 +101,10 @@ class LocalPool(ThreadPoolExecutor):
     def __init__(self, workers: int) -> None:
         super().__init__(workers)
         self._own = threading.local()
-        self._all: list[ProcessPoolExecutor] = []
+        self._all: list[futures.ProcessPoolExecutor] = []
         self._ended = False
 
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> futures.Future[Any]:
         return super().submit(self._call, partial(fn, *args, **kwargs))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
@@ -135,7 +128,7 @@ class LocalPool(ThreadPoolExecutor):
                 return process.submit(call).result()
         raise WorkerKilled
 
-    def _process(self) -> ProcessPoolExecutor:
+    def _process(self) -> futures.ProcessPoolExecutor:
         """This thread's process, once it runs: one that is killed while starting does not count against the task."""
         for _ in range(STARTS if not self._ended else 0):
             process = getattr(self._own, "process", None) or self._start()
@@ -145,8 +138,8 @@ class LocalPool(ThreadPoolExecutor):
             self._own.process = None
         raise WorkerKilled
 
-    def _start(self) -> ProcessPoolExecutor:
-        process = ProcessPoolExecutor(1, ScriptlessContext(), initializer=prepare)
+    def _start(self) -> futures.ProcessPoolExecutor:
+        process = futures.ProcessPoolExecutor(1, ScriptlessContext(), initializer=prepare)
         self._own.process = process
         self._all.append(process)
         return process
@@ -176,7 +169,7 @@ def _end_with_parent() -> None:
 def iterate_results(
     function: Callable[[Task], Made],
     tasks: Iterable[Task],
-    executor: Executor | None = None,
+    executor: futures.Executor | None = None,
     in_flight: int | None = None,
 ) -> Iterator[tuple[Task, Made | Exception]]:
     """Yield each task with its result, or with the exception of an executor that lost it, in order of completion.
@@ -187,13 +180,13 @@ def iterate_results(
         yield from ((task, function(task)) for task in tasks)
         return
     window = in_flight or TASKS_A_CORE * (os.cpu_count() or 1)
-    left, running = iter(tasks), dict[Future[Made], Task]()
+    left, running = iter(tasks), dict[futures.Future[Made], Task]()
     try:
         while True:
             running |= {executor.submit(function, task): task for task in islice(left, window - len(running))}
             if not running:
                 return
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
+            for future in wait(running, return_when=futures.FIRST_COMPLETED).done:
                 task = running.pop(future)
                 try:  # tasks themselves raise nothing
                     result: Made | Exception = future.result()
@@ -232,7 +225,7 @@ class NotMeasured(Exception):
 
 
 @contextmanager
-def cluster_executor(address: str, scans: Sequence[str], workers: int | None = None) -> Iterator[Executor]:
+def cluster_executor(address: str, scans: Sequence[str], workers: int | None = None) -> Iterator[futures.Executor]:
     """Executor of a running scheduler, or of a local one that lives as long as the block.
 
     Parameters
@@ -278,32 +271,32 @@ def cluster_executor(address: str, scans: Sequence[str], workers: int | None = N
         yield SubmittedAgain(client.get_executor(retries=_RETRIES, pure=False))
 
 
-class SubmittedAgain(Executor):
+class SubmittedAgain(futures.Executor):
     """Executor that resubmits lost tasks to another executor.
 
     Tasks raise nothing themselves, so an exception means that the worker is gone. A task lost KILLS times is given up.
     """
 
-    def __init__(self, executor: Executor) -> None:
+    def __init__(self, executor: futures.Executor) -> None:
         self._executor = executor
 
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        outer: Future[Any] = Future()
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> futures.Future[Any]:
+        outer: futures.Future[Any] = futures.Future()
         self._begin(outer, partial(fn, *args, **kwargs), KILLS)
         return outer
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         self._executor.shutdown(wait, cancel_futures=cancel_futures)
 
-    def _begin(self, outer: Future[Any], call: Callable[[], Any], left: int) -> None:
+    def _begin(self, outer: futures.Future[Any], call: Callable[[], Any], left: int) -> None:
         try:
             inner = self._executor.submit(call)
         except Exception as error:  # lost connection to the scheduler
-            outer.set_exception(BrokenExecutor(str(error)))
+            outer.set_exception(futures.BrokenExecutor(str(error)))
             return
         inner.add_done_callback(partial(self._done, outer, call, left - 1))
 
-    def _done(self, outer: Future[Any], call: Callable[[], Any], left: int, inner: Future[Any]) -> None:
+    def _done(self, outer: futures.Future[Any], call: Callable[[], Any], left: int, inner: futures.Future[Any]) -> None:
         if outer.cancelled():
             return
         if not inner.cancelled() and inner.exception() is None:
@@ -328,9 +321,7 @@ def _check_workers(client: "Client", address: str, scans: Sequence[str]) -> None
             complaints.append(f"{worker}: does not answer ({answer}): is reseau installed there?")
             continue
         there, missing = answer
-        other = [
-            f"{name} {there.get(name, 'none')}, here {own}" for name, own in here.items() if there.get(name) != own
-        ]
+        other = [f"{key} {there.get(key, 'none')}, here {own}" for key, own in here.items() if there.get(key) != own]
         if other:
             complaints.append(f"{worker}: has {'; '.join(other)}. Install the same there.")
         if missing:

@@ -24,14 +24,7 @@ from pipeline.archive.made_from import adjusted_from
 from pipeline.errors import InputError
 from pipeline.files.project_file import ASSUMED_PITCH_UM, Project
 from pipeline.files.project_tables import AdjustSettings
-from pipeline.measuring.target_field import (
-    across,
-    check_spacing,
-    disk_normals,
-    eccentricity_mm,
-    plane_normal,
-    target_field,
-)
+from pipeline.measuring import target_field
 from pipeline.progress import Reporter
 from pipeline.publishing import unpublished
 from pipeline.results.comparator_file import ComparatorPoint, has_pixels_alone, read_comparator
@@ -108,7 +101,7 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     adjusted = partial(adjust, options=options)
     misnamed, notes = _misnamed(project, marks), (*_assumed_pitch(project), *_unmeasured(project, marks))
     if project.disk_radius > 0.0:
-        check_spacing(project, target_field(project))
+        target_field.check_spacing(project, target_field.target_field(project))
     network, left_out = build_network(project, marks)
     network, untold = add_scanner_bends(project, network, adjusted)
     first = adjust_unmodelled(network, options) if project.adjust.unmodelled == "estimate" else adjusted(network)
@@ -163,7 +156,7 @@ def _eccentricities(adjustment: Adjustment, given: Mapping[str, Array], radius: 
     ids = [point.id for point in network.points]
     coordinates = adjusted_places(adjustment, ids)
     row_of = {id: row for row, id in enumerate(ids)}
-    plane = plane_normal(coordinates)
+    plane = target_field.plane_normal(coordinates)
     known_part, unknown_part = np.zeros_like(observations.xy_mm), np.zeros_like(observations.xy_mm)
     for image in network.images:
         rows = [
@@ -175,11 +168,13 @@ def _eccentricities(adjustment: Adjustment, given: Mapping[str, Array], radius: 
             continue
         at = [row_of[observations.point[i]] for i in rows]
         model, places = adjusted_image(adjustment, image.name), coordinates[at]
-        normals, known = disk_normals([ids[k] for k in at], places, given, plane, model.station)
-        known_part[rows] = np.where(known[:, None], eccentricity_mm(model, places, normals, radius), 0.0)
+        normals, known = target_field.disk_normals([ids[k] for k in at], places, given, plane, model.station)
+        known_part[rows] = np.where(known[:, None], target_field.eccentricity_mm(model, places, normals, radius), 0.0)
         sight = (model.station - places) / np.linalg.norm(model.station - places, axis=1, keepdims=True)
-        slanted = (sight + across(sight)[0]) / np.sqrt(2.0)  # at 45° to it, where the eccentricity is largest
-        unknown_part[rows] = np.where(known[:, None], 0.0, eccentricity_mm(model, places, slanted, radius))
+        slanted = (sight + target_field.across(sight)[0]) / np.sqrt(
+            2.0
+        )  # at 45° to it, where the eccentricity is largest
+        unknown_part[rows] = np.where(known[:, None], 0.0, target_field.eccentricity_mm(model, places, slanted, radius))
     return known_part, unknown_part
 
 

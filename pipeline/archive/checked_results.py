@@ -22,17 +22,8 @@ import numpy as np
 from adjust.problem.observations import ObservationKind
 from measure.flags import Code, Reason, Status
 from measure.results import FrameMeasurement
+from pipeline.archive import schema
 from pipeline.archive.results_database import Store
-from pipeline.archive.schema import (
-    FRAMES_DIGEST,
-    MARKS,
-    check_judging,
-    checked_marks_digest,
-    damaged_frames,
-    damaged_judging,
-    damaged_result,
-    is_sound,
-)
 from pipeline.archive.verdicts import Verdict, scan_doubt, scan_verdict
 from pipeline.errors import InputError
 from pipeline.provenance import hash_file
@@ -73,7 +64,7 @@ class Judging:
 
     def check(self) -> None:
         """Raise DamagedError where the list of frames is damaged."""
-        check_judging(self.store.connection, self.row, self.store.path)
+        schema.check_judging(self.store.connection, self.row, self.store.path)
 
     def values(self, columns: str) -> list[tuple[Any, ...]]:
         """Columns of checked_frame, for all frames."""
@@ -125,7 +116,7 @@ class Judging:
                 detail = json.loads(measured) | json.loads(changed or "{}")
                 yield read_scan(name, detail, list(map(read_mark_row, rows)), scan_location(uri, folder))
             except (ValueError, TypeError, KeyError):
-                sentence = str(damaged_result(name, self.store.path))
+                sentence = str(schema.damaged_result(name, self.store.path))
                 frame = FrameMeasurement(name, (), problems=(Reason(sentence, Code.FAILED_SCAN),))
                 yield MeasuredScan.failed("", frame, Failure(FailureCode.DAMAGED, sentence))
 
@@ -136,7 +127,7 @@ class Judging:
         """
         for name, (across_um, down_um), rows in self._frames("pitch_x_um, pitch_y_um", images):
             if rows is None:
-                raise damaged_result(name, self.store.path)
+                raise schema.damaged_result(name, self.store.path)
             for point, kind, col, row, *spread, causes, status, _, reason, _ in rows:
                 xy_mm = sigma_mm = None
                 rho = 0.0
@@ -159,7 +150,9 @@ class Judging:
         for name, scan in [frame for frame in frames if frame[0] in names]:
             query = f"select is_whole, {columns} from checked_frame {own}"
             is_whole, *values = connection.execute(query, (self.row, scan)).fetchone()
-            marks = connection.execute(f"select {MARKS} from checked_mark {own} order by number", (self.row, scan))
+            marks = connection.execute(
+                f"select {schema.MARKS} from checked_mark {own} order by number", (self.row, scan)
+            )
             yield name, values, [row[1:] for row in marks] if is_whole else None
 
     @cached_property
@@ -274,7 +267,7 @@ def judge_lots(store: Store, made_from: Mapping[str, str], input_hash: str, lots
     digest = hasher.hexdigest()
     with store.writing():
         store.connection.execute("delete from judging where digest = ?", (digest,))
-        update = f"update judging set digest = ?, frames_digest = {FRAMES_DIGEST} where id = ?"
+        update = f"update judging set digest = ?, frames_digest = {schema.FRAMES_DIGEST} where id = ?"
         store.connection.execute(update, (digest, row))
     return Judging(store, row, digest, made, input_hash)
 
@@ -290,7 +283,9 @@ def _copy_lot(store: Store, judging: int, number: int, lot: Lot) -> str:
     if not lot.input or found is None:
         return ""
     before, old, output = found
-    is_whole = f"{is_sound('judged_frame')} and (not own_marks or marks_digest is {checked_marks_digest()})"
+    is_whole = (
+        f"{schema.is_sound('judged_frame')} and (not own_marks or marks_digest is {schema.checked_marks_digest()})"
+    )
     if store.first(f"select exists (select 1 {own} and not ({is_whole}))", before, old):
         return ""
     frame = "scan, result, name, verdict, why, own_marks, detail, decisions, marks_digest"
@@ -300,7 +295,7 @@ def _copy_lot(store: Store, judging: int, number: int, lot: Lot) -> str:
             (judging, number, before, old),
         )
         store.connection.execute(
-            f"insert into judged (judging, result, {MARKS}) select ?, result, {MARKS} "
+            f"insert into judged (judging, result, {schema.MARKS}) select ?, result, {schema.MARKS} "
             f"from judged where judging = ? and result in (select result {own} and own_marks)",
             (judging, before, before, old),
         )
@@ -335,7 +330,7 @@ def _write_frame(store: Store, judging: int, lot: int, frame: CheckedResult) -> 
     store.insert("judged_frame", keys | checked | {"own_marks": own_marks, "detail": detail})
     store.insert_marks("judged", keys, rows)
     store.connection.execute(
-        f"update judged_frame set marks_digest = {checked_marks_digest()} where judging = ? and scan = ?",
+        f"update judged_frame set marks_digest = {schema.checked_marks_digest()} where judging = ? and scan = ?",
         (judging, scan),
     )
     return json.dumps([frame.scan.frame.image, key, detail, rows]).encode()
@@ -343,26 +338,26 @@ def _write_frame(store: Store, judging: int, lot: int, frame: CheckedResult) -> 
 
 def find_judging(store: Store, digest: str) -> Judging | None:
     """Judging with that digest, None if there is none. Raises DamagedError where its row is damaged."""
-    query = f"select {is_sound('judging')}, id, digest, made_from, input from judging where digest = ?"
+    query = f"select {schema.is_sound('judging')}, id, digest, made_from, input from judging where digest = ?"
     found = store.connection.execute(query, (digest,)).fetchone()
     if found is None:
         return None
     is_whole, row, digest, made_from, input_hash = found
     if not is_whole:
-        raise damaged_judging(store.path)
+        raise schema.damaged_judging(store.path)
     return Judging(store, row, digest, json.loads(made_from), input_hash)
 
 
 def latest(store: Store) -> Judging | None:
     """Latest judging, None if there is none. Raises DamagedError where one is missing or damaged."""
     is_lost = store.first(
-        f"select exists (select 1 from judging where seal is not null and not {is_sound('judging')}) or "
+        f"select exists (select 1 from judging where seal is not null and not {schema.is_sound('judging')}) or "
         "exists (select 1 from judged_frame where judging not in (select id from judging))"
     )
     digest = store.first(f"select digest from judging where not {_UNFINISHED} order by id desc limit 1")
     judging = None if is_lost or digest is None else find_judging(store, digest)
     if is_lost or (judging is None and digest is not None):  # the index of digests used for the lookup lacks the row
-        raise damaged_judging(store.path)
+        raise schema.damaged_judging(store.path)
     return judging
 
 
@@ -385,7 +380,7 @@ def written_judging(path: Path, comparator: Path) -> Iterator[Judging | None]:
             yield None
             return
         judging.check()
-        yield None if damaged_frames(judging.store.connection, judging.row) else judging
+        yield None if schema.damaged_frames(judging.store.connection, judging.row) else judging
 
 
 def read_measurement(path: FilePath, digest: str = "") -> tuple[MeasuredScan, ...]:

@@ -119,7 +119,7 @@ def _project_inputs(project: Project, tasks: Sequence[ScanTask], input_hash: str
     return [
         project.targets,
         points,
-        [project.scanned_frame(task.name) for task in tasks] if project.has_parts else None,
+        [project.scanned_frame(each.name) for each in tasks] if project.has_parts else None,
     ]
 
 

@@ -89,9 +89,7 @@ def current_adjustment(project: Project, marks: Sequence[ComparatorPoint]) -> Ad
 
 def adjusted_from(project: Project, marks: Sequence[ComparatorPoint]) -> MadeFrom:
     """Inputs of an adjustment: the marks that are observations, the given values, and the settings."""
-    observations = sorted(
-        (mark.image, mark.kind, mark.point, *_numbers(mark)) for mark in marks if mark.status.is_observation
-    )
+    observations = sorted((m.image, m.kind, m.point, *_numbers(m)) for m in marks if m.status.is_observation)
     cameras = {name: [camera.camera(), camera.calibration, camera.frame_mm] for name, camera in project.cameras.items()}
     return {
         MARKS: fingerprint(observations),

@@ -85,9 +85,7 @@ def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, 
                 taken.add(state.uri)
                 found += 1
     if unknown:
-        reporter.say(
-            f"{found} of {len(unknown)} files that are new or changed have the content of ones that are measured"
-        )
+        reporter.say(f"{found} of {len(unknown)} new or changed files have the content of ones that are measured")
     return keys
 
 
@@ -165,6 +163,6 @@ def open_executor(project: Project, options: WorkOptions) -> AbstractContextMana
     """Executor for the project's scans: local processes or the workers of a cluster."""
     if options.cluster is not None:
         return cluster_executor(
-            options.cluster, [fetch_location(path) for path in project.scans.values()], options.workers
+            options.cluster, [fetch_location(each) for each in project.scans.values()], options.workers
         )
     return worker_pool(len(project.scans), options.workers)

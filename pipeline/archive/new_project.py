@@ -14,14 +14,7 @@ from rich.console import Console
 from measure.errors import MeasurementError
 from measure.scans.opening import ScanHead
 from measure.scans.remote import Address, is_address, scan_path
-from pipeline.archive.scan_groups import (
-    CANDIDATES,
-    Catalogue,
-    ScanGroup,
-    catalogue,
-    identify_sample,
-    name_cameras,
-)
+from pipeline.archive import scan_groups
 from pipeline.errors import InputError
 from pipeline.files.camera_file import read_camera
 from pipeline.files.library import PREFIX, camera_words, library_path, read_library
@@ -52,11 +45,11 @@ class NewProject:
 
     folder: Path
     given: tuple[Path, ...]
-    found: Catalogue
+    found: scan_groups.Catalogue
     left_out: Mapping[str, Sequence[Path]]
 
     @property
-    def named(self) -> list[ScanGroup]:
+    def named(self) -> list[scan_groups.ScanGroup]:
         return [group for group in self.found.groups if group.camera]
 
     @property
@@ -65,12 +58,12 @@ class NewProject:
         return any(cases for _, cases in self.remarks())
 
     @property
-    def digital(self) -> list[ScanGroup]:
+    def digital(self) -> list[scan_groups.ScanGroup]:
         """Groups of images taken by digital cameras."""
         return [group for group in self.found.groups if group.digital]
 
     @property
-    def unknown(self) -> list[ScanGroup]:
+    def unknown(self) -> list[scan_groups.ScanGroup]:
         """Groups of film scans of an unknown camera."""
         return [group for group in self.found.groups if not group.camera and not group.digital]
 
@@ -113,10 +106,7 @@ class NewProject:
             "drawing with a scan",
             [f"{_place(group)}: {group.camera}" for group in self.named if group.rests_on_form],
         )
-        yield (
-            "are no scans of film, and are left out",
-            [f"{_place(group)}: {group.why_not()}" for group in self.digital],
-        )
+        yield ("are no scans of film, and are left out", [f"{_place(one)}: {one.why_not()}" for one in self.digital])
         numbers = defaultdict[str, set[str]](set)
         for group in self.named:
             numbers[group.camera].update(group.numbers)
@@ -124,9 +114,7 @@ class NewProject:
             "are of several cameras of one type, by their plates: give each a camera file with its number",
             [f"{name}: Nr {', '.join(sorted(own))}" for name, own in numbers.items() if len(own) > 1],
         )
-        against = {
-            group: [each for sample in group.samples if (each := sample.against_pitch())] for group in self.named
-        }
+        against = {group: [why for sample in group.samples if (why := sample.against_pitch())] for group in self.named}
         yield (
             "have a resolution in their files that their marks contradict",
             [f"{group.folder}: {sentences[0]}" for group, sentences in against.items() if sentences],
@@ -188,7 +176,7 @@ class NewProject:
         alike = defaultdict[tuple[str, ...], list[str]](list)
         for group in self.named:
             if group.cameras[1:]:
-                others = [name for name in group.candidates if name != group.camera][: CANDIDATES - 1]
+                others = [name for name in group.candidates if name != group.camera][: scan_groups.CANDIDATES - 1]
                 alike[group.camera, *others].append(str(group.folder))
         return {cameras: sorted(set(folders)) for cameras, folders in alike.items()}
 
@@ -209,12 +197,12 @@ def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pi
             raise InputError(f"there is no {path} (searched at {path.absolute()}). Give folders with scans, or scans.")
     with reporter.stage("examining file") as count:
         try:
-            found = catalogue(given, count, max_pixels)
+            found = scan_groups.catalogue(given, count, max_pixels)
         except MeasurementError as error:
             raise InputError(str(error)) from error
-    trial = partial(identify_sample, cameras=read_library(), pitch_um=None, max_pixels=max_pixels)
+    trial = partial(scan_groups.identify_sample, cameras=read_library(), pitch_um=None, max_pixels=max_pixels)
     with worker_pool(sum(len(group.to_try) for group in found.groups)) as workers:
-        found = name_cameras(found, trial, reporter, workers)
+        found = scan_groups.name_cameras(found, trial, reporter, workers)
     new = NewProject(folder, tuple(given), found, _left_out(found))
     if new.digital and not new.cameras:
         lines = [f"{_place(group)}, {group.digital}: {group.calibrate_command}" for group in new.digital]
@@ -272,7 +260,7 @@ def print_new_project(new: NewProject, console: Console) -> None:
         console.print(text, style=style, highlight=False, soft_wrap=True, markup=False)
 
     say(f"{counted(new.found.files, 'file')} examined: {new.sentence}.")
-    of_camera = defaultdict[str, list[ScanGroup]](list)
+    of_camera = defaultdict[str, list[scan_groups.ScanGroup]](list)
     for group in new.found.groups:
         of_camera[group.camera or ("digital camera" if group.digital else "camera unknown")].append(group)
     for camera, groups in sorted(of_camera.items()):
@@ -290,7 +278,7 @@ def print_new_project(new: NewProject, console: Console) -> None:
     say(f"Written: {new.folder / 'project.toml'}, {new.folder / 'images.csv'} ({len(new.cameras)} scans).")
 
 
-def _left_out(found: Catalogue) -> dict[str, list[Path]]:
+def _left_out(found: scan_groups.Catalogue) -> dict[str, list[Path]]:
     """{reason: files}."""
     # Without any identified camera, the camera file to be added covers all scans: none is left out for it.
     is_named = any(group.camera for group in found.groups)
@@ -372,7 +360,7 @@ def _relative_name(folder: Path, path: Path) -> str:
     return path.location if isinstance(path, Address) else Path(os.path.relpath(path, folder)).as_posix()
 
 
-def _place(group: ScanGroup) -> str:
+def _place(group: scan_groups.ScanGroup) -> str:
     if len(group.paths) == 1:
         return str(group.paths[0])
     return f"{group.folder}, {counted(len(group.paths), 'scan')}, {_form(group.head)}"

@@ -303,7 +303,7 @@ def name_cameras(grouped: Catalogue, identified: Try, reporter: Reporter, worker
     unread = {path: answer for path, answer in answers.items() if isinstance(answer, str)}
     known = {path: answer for path, answer in answers.items() if not isinstance(answer, str)}
     groups = [
-        replace(group, samples=tuple(known[path] for path in group.to_try if path in known)) for group in grouped.groups
+        replace(one, samples=tuple(known[path] for path in one.to_try if path in known)) for one in grouped.groups
     ]
     parts = tuple(part for group in groups for part in _split_cameras(group))
     return replace(grouped, groups=parts, unread={**grouped.unread, **unread})

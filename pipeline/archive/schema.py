@@ -376,11 +376,9 @@ _MOVE = "Move it away, and run `reseau measure` again."
 
 def _check(connection: sqlite3.Connection, path: Path, schema: Schema) -> None:
     """Raise InputError for a file that this version cannot read."""
-    version, application = (
-        connection.execute(f"pragma {name}").fetchone()[0] for name in ("user_version", "application_id")
-    )
+    version, owner = (connection.execute(f"pragma {key}").fetchone()[0] for key in ("user_version", "application_id"))
     has_tables = connection.execute("select count(*) from sqlite_master").fetchone()[0] > 0
-    if has_tables and application != schema.application:
+    if has_tables and owner != schema.application:
         raise InputError(f"{path}: is an SQLite file that was not written by reseau for {schema.what}. {_MOVE}")
     if version > schema.version:
         raise InputError(

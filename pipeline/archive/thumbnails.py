@@ -105,9 +105,7 @@ class Thumbnails:
         """
         self._max_pixels = max_pixels
         self._scans = {scan.frame.image: scan for scan in scans}
-        self._marks = {
-            (s.frame.image, mark.point, mark.kind == "fiducial"): mark for s in scans for mark in s.frame.marks
-        }
+        self._marks = {(s.frame.image, m.point, m.kind == "fiducial"): m for s in scans for m in s.frame.marks}
         self._fingerprints = fingerprints or {}
         self._kept: ThumbnailStore | None = None
         if measurement is not None and thumbnails_path(measurement).exists():

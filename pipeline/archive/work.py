@@ -13,15 +13,8 @@ import numpy as np
 
 from measure.errors import MeasurementError
 from measure.scans.remote import scan_path
+from pipeline.archive import review_decisions
 from pipeline.archive.results_database import Kept, Store
-from pipeline.archive.review_decisions import (
-    after_checks,
-    apply_decisions,
-    before_checks,
-    decisions_hash,
-    group_decisions,
-    request_hasher,
-)
 from pipeline.archive.thumbnails import ThumbnailStore
 from pipeline.files.decisions_file import About, Decision
 from pipeline.files.project_file import Project
@@ -57,8 +50,8 @@ class Work:
         self._identities, self._rows = store.identities(), store.fingerprints()
         self._files = FileStates(self._folder)
         self._states: dict[str, FileState] = {}
-        self._asked = request_hasher(project)
-        self.decisions = group_decisions(project.decisions)  # by image, the oldest first
+        self._asked = review_decisions.request_hasher(project)
+        self.decisions = review_decisions.group_decisions(project.decisions)  # by image, the oldest first
         self.counting = defaultdict[str, Mapping[About, Decision]](dict)  # by image, of its last request
         self._now: set[int] = set()  # rows measured in this run
         self.results: dict[str, int] = {}  # by image, row of the result of its last request
@@ -85,7 +78,7 @@ class Work:
     def read(self, name: str) -> MeasuredScan:
         """Scan of an image as last requested, with all decisions applied except acceptance (`before_checks`)."""
         scan = self._store.scan(self.results[name], name, self._folder)
-        return before_checks(scan, self.counting[name])
+        return review_decisions.before_checks(scan, self.counting[name])
 
     def picture(self, scan: MeasuredScan) -> Array | None:
         """Reduced grey values (rows, columns) of a whole scan, stored or read again; None where it cannot be read."""
@@ -112,11 +105,11 @@ class Work:
 
     def decisions_hash(self, name: str) -> str:
         """Hash of all decisions about an image, whether they apply or not."""
-        return decisions_hash(self.decisions.get(name, ()))
+        return review_decisions.decisions_hash(self.decisions.get(name, ()))
 
     def apply_decisions(self, scan: MeasuredScan) -> MeasuredScan:
         """Checked scan with all decisions applied."""
-        return after_checks(scan, self.counting[scan.frame.image])
+        return review_decisions.after_checks(scan, self.counting[scan.frame.image])
 
     def keys(self) -> dict[str, str]:
         """{image: fingerprint of its last requested result}."""
@@ -172,7 +165,7 @@ class Work:
         if decisions is None:
             return task
         identity = self._identity(task) or Identity(self.state(task), parts_hash(scan_path(task.scan)))
-        task, self.counting[task.name] = apply_decisions(
+        task, self.counting[task.name] = review_decisions.apply_decisions(
             task,
             decisions,
             lambda one: result_key(identity, _hash_of(_options_json(one))),

@@ -6,25 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.commands.shared import (
-    DONE,
-    LOOK,
-    AsJson,
-    MaxPixels,
-    OfCamera,
-    OutDir,
-    ProjectFile,
-    SceneFile,
-    command_step,
-    finish,
-    page_step,
-    pitch_option,
-    print_next,
-    read,
-    run_stage,
-    say,
-    show,
-)
+from pipeline.commands import shared
 from pipeline.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,40 +15,40 @@ if TYPE_CHECKING:
 OUT = Path("calibration")
 
 
-def adjust(project: ProjectFile, as_json: AsJson = False, max_pixels: MaxPixels = None) -> int:
+def adjust(project: shared.ProjectFile, as_json: shared.AsJson = False, max_pixels: shared.MaxPixels = None) -> int:
     """Adjust: orientations, camera, film and fiducials at once."""
     from pipeline.stages import run_adjust
 
-    return run_stage(project, run_adjust, as_json, max_pixels)
+    return shared.run_stage(project, run_adjust, as_json, max_pixels)
 
 
-def check(project: ProjectFile, as_json: AsJson = False) -> int:
+def check(project: shared.ProjectFile, as_json: shared.AsJson = False) -> int:
     """Compare the adjustment with OpenCV's calibration."""
     from pipeline.stages import run_check
 
-    return run_stage(project, run_check, as_json)
+    return shared.run_stage(project, run_check, as_json)
 
 
-def choose(project: ProjectFile, as_json: AsJson = False) -> int:
+def choose(project: shared.ProjectFile, as_json: shared.AsJson = False) -> int:
     """Select lens and film models by tests and cross-validation."""
     from pipeline.adjusting.adjust_stage import print_choice, run_choose
     from pipeline.progress import Reporter
 
-    settings = read(project)
+    settings = shared.read(project)
     choice, record = run_choose(settings, Reporter())
-    show(as_json, lambda: record, lambda console: print_choice(choice, console, settings.choice_path))
+    shared.show(as_json, lambda: record, lambda console: print_choice(choice, console, settings.choice_path))
     is_as_given = choice.chosen is not None and choice.chosen.model == choice.given
     set_first = "" if is_as_given else "after the selected model is set in project.toml and camera.toml"
-    print_next(as_json, command_step("run", project, why=set_first))
-    return DONE if is_as_given else LOOK
+    shared.print_next(as_json, shared.command_step("run", project, why=set_first))
+    return shared.DONE if is_as_given else shared.LOOK
 
 
 def block(
-    project: ProjectFile,
-    out_dir: OutDir,
-    pitch_um: Annotated[float | None, pitch_option("Pixel of the pictures; by default the scans'.")] = None,
-    max_pixels: MaxPixels = None,
-    as_json: AsJson = False,
+    project: shared.ProjectFile,
+    out_dir: shared.OutDir,
+    pitch_um: Annotated[float | None, shared.pitch_option("Pixel of the pictures; by default the scans'.")] = None,
+    max_pixels: shared.MaxPixels = None,
+    as_json: shared.AsJson = False,
 ) -> int:
     """Orient overlapping frames by COLMAP, and adjust them."""
     from pipeline.blocks.block_stage import run_block
@@ -74,14 +56,14 @@ def block(
     from pipeline.stages import run_adjust
 
     reporter = Reporter()
-    oriented, left_out, lines = run_block(read(project, max_pixels), out_dir, pitch_um, reporter)
+    oriented, left_out, lines = run_block(shared.read(project, max_pixels), out_dir, pitch_um, reporter)
     summary = run_adjust(oriented, reporter)
     if not as_json:
-        say(*lines)
-    code = finish(summary, as_json, None)
+        shared.say(*lines)
+    code = shared.finish(summary, as_json, None)
     files = f"{out_dir / 'comparator.csv'} and {out_dir / 'images.csv'}"
-    print_next(as_json, f"name {files} in a copy of project.toml without scans, then reseau run that copy")
-    return max(code, LOOK) if left_out else code
+    shared.print_next(as_json, f"name {files} in a copy of project.toml without scans, then reseau run that copy")
+    return max(code, shared.LOOK) if left_out else code
 
 
 def compare(
@@ -91,7 +73,7 @@ def compare(
             metavar="A/adjustment.json B/adjustment.json...", help="The calibrations' files.", show_default=False
         ),
     ],
-    camera: OfCamera = None,
+    camera: shared.OfCamera = None,
     times: Annotated[str | None, typer.Option(metavar="T,T,...", help="When they were made: 1952,1958.5.")] = None,
     flat: Annotated[
         bool,
@@ -103,7 +85,7 @@ def compare(
         float, typer.Option(min=1e-12, max=0.5, help="Significance level of the test: drift below this p-value.")
     ] = 0.01,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write compare.json and compare.svg there.")] = None,
-    as_json: AsJson = False,
+    as_json: shared.AsJson = False,
 ) -> int:
     """Compare calibrations of a camera: `drift` or `no drift`."""
     from pipeline.adjusting.compare_stage import print_comparison, run_compare
@@ -111,34 +93,36 @@ def compare(
 
     when = None if times is None else _numbers(times)
     comparison, record = run_compare(adjustments, camera, when, "flat" if flat else "space", level, out)
-    show(as_json, lambda: record, lambda console: print_comparison(comparison, record, console))
+    shared.show(as_json, lambda: record, lambda console: print_comparison(comparison, record, console))
     has_drift = record.verdict == DRIFT
-    print_next(
+    shared.print_next(
         as_json,
         "use each calibration for the photographs of its time"
         if has_drift
         else "use any of them; one project with the photographs of all gives the smallest standard deviations",
     )
-    return LOOK if has_drift else DONE
+    return shared.LOOK if has_drift else shared.DONE
 
 
 def design(
-    scene: SceneFile,
+    scene: shared.SceneFile,
     out_dir: Annotated[
         Path | None, typer.Argument(metavar="[OUT_DIR]", help="Where design.json goes; SCENE-design by default.")
     ] = None,
-    as_json: AsJson = False,
+    as_json: shared.AsJson = False,
 ) -> int:
     """Expected precision of planned photographs."""
     from pipeline.design.summary import print_design, run_design
     from pipeline.progress import Reporter
 
     planned = run_design(scene, out_dir, Reporter())
-    show(as_json, planned.content, lambda console: print_design(planned, console))
+    shared.show(as_json, planned.content, lambda console: print_design(planned, console))
     if planned.has_findings:
-        print_next(as_json, command_step("design", scene, why="after the scene is changed as the tables suggest"))
-    print_next(as_json, command_step("render", scene, "DIR", why="synthetic scans of this plan"))
-    return LOOK if planned.has_findings else DONE
+        shared.print_next(
+            as_json, shared.command_step("design", scene, why="after the scene is changed as the tables suggest")
+        )
+    shared.print_next(as_json, shared.command_step("render", scene, "DIR", why="synthetic scans of this plan"))
+    return shared.LOOK if planned.has_findings else shared.DONE
 
 
 def _numbers(text: str) -> list[float]:
@@ -167,7 +151,7 @@ def calibrate(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where the results go.")] = OUT,
     ros: Annotated[bool, typer.Option("--ros", help="Write ROS's camera info as well.")] = False,
     workers: Annotated[int | None, typer.Option(metavar="N", min=1, max=1024, help="Processes.")] = None,
-    as_json: AsJson = False,
+    as_json: shared.AsJson = False,
 ) -> int:
     """Calibrate a digital camera from pictures of a board."""
     from pipeline.calibration.calibrate_stage import calibrate
@@ -188,13 +172,13 @@ def calibrate(
         ros=ros,
         workers=workers,
     )
-    show(as_json, found.as_json, found.print)
-    print_next(as_json, *_steps(found))
-    return LOOK if found.needs_review else DONE
+    shared.show(as_json, found.as_json, found.print)
+    shared.print_next(as_json, *_steps(found))
+    return shared.LOOK if found.needs_review else shared.DONE
 
 
 def _steps(found: "Calibration") -> Iterator[str]:
-    yield page_step(found.report)
+    yield shared.page_step(found.report)
     if found.summary.verdict.problems:
-        yield command_step("run", found.project, why="after the remedies above")
-    yield command_step("export", found.project, "opencv", "DIR", why="or colmap, metashape, micmac, ...")
+        yield shared.command_step("run", found.project, why="after the remedies above")
+    yield shared.command_step("export", found.project, "opencv", "DIR", why="or colmap, metashape, micmac, ...")

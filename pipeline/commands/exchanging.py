@@ -5,23 +5,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.commands.shared import (
-    DONE,
-    LOOK,
-    AsJson,
-    MaxPixels,
-    OfCamera,
-    OutDir,
-    ProjectFile,
-    SceneFile,
-    choices_help,
-    command_step,
-    pitch_option,
-    print_next,
-    read,
-    say,
-    show,
-)
+from pipeline.commands import shared
 from pipeline.errors import InputError
 from pipeline.exchange.formats import FORMATS, IMPORTED, LARGEST_MISFIT_PX, ExportOptions
 from pipeline.text.wording import counted, did_you_mean
@@ -34,13 +18,13 @@ FAMILIES = (  # `FAMILY_NAMES`, without numpy
 
 
 def resample(
-    project: ProjectFile,
-    out_dir: OutDir,
-    pitch_um: Annotated[float | None, pitch_option("The frames' pixel; by default the scan's.")] = None,
+    project: shared.ProjectFile,
+    out_dir: shared.OutDir,
+    pitch_um: Annotated[float | None, shared.pitch_option("The frames' pixel; by default the scan's.")] = None,
     lens: Annotated[bool, typer.Option("--lens", help="Take the distortion out, too.")] = False,
     fast: Annotated[bool, typer.Option("--fast", help="Splines of degree 3, not 5: faster, less exact.")] = False,
-    max_pixels: MaxPixels = None,
-    as_json: AsJson = False,
+    max_pixels: shared.MaxPixels = None,
+    as_json: shared.AsJson = False,
 ) -> int:
     """Rectify scans into the camera frame."""
     from pipeline.progress import Reporter
@@ -52,34 +36,35 @@ def resample(
         doubt = f"; needs a look: {result.doubt}" if result.doubt else ""
         return f"{result.image}: {outcome}{clamped}{doubt}"
 
-    results = resample(read(project, max_pixels), out_dir, pitch_um, lens, fast, Reporter())
-    show(as_json, lambda: resampled_json(results), lambda _: say(*map(line, results)))
+    results = resample(shared.read(project, max_pixels), out_dir, pitch_um, lens, fast, Reporter())
+    shared.show(as_json, lambda: resampled_json(results), lambda _: shared.say(*map(line, results)))
     same = [*(("--pitch-um", f"{pitch_um:g}") if pitch_um else ()), *(("--lens",) if lens else ())]
-    print_next(
+    shared.print_next(
         as_json,
-        command_step("export", project, "micmac", "DIR", *same, why="or metashape, ...: cameras of these frames"),
+        shared.command_step(
+            "export", project, "micmac", "DIR", *same, why="or metashape, ...: cameras of these frames"
+        ),
     )
-    return LOOK if any(result.problem or result.doubt for result in results) else DONE
+    return shared.LOOK if any(result.problem or result.doubt for result in results) else shared.DONE
 
 
 def export(
-    project: ProjectFile,
-    format: Annotated[str, typer.Argument(metavar="FORMAT", help=choices_help(FORMATS), show_default=False)],
-    out_dir: OutDir,
-    pitch_um: Annotated[float | None, pitch_option("As given to `reseau resample`.")] = None,
+    project: shared.ProjectFile,
+    format: Annotated[str, typer.Argument(metavar="FORMAT", help=shared.choices_help(FORMATS), show_default=False)],
+    out_dir: shared.OutDir,
+    pitch_um: Annotated[float | None, shared.pitch_option("As given to `reseau resample`.")] = None,
     lens: Annotated[bool, typer.Option("--lens", help="For frames of `reseau resample --lens`.")] = False,
     misfit_px: Annotated[
-        float,
-        typer.Option("--misfit-px", metavar="PX", min=0.0, help="How far another program's lens may be off."),
+        float, typer.Option("--misfit-px", metavar="PX", min=0.0, help="How far another program's lens may be off.")
     ] = LARGEST_MISFIT_PX,
-    max_pixels: MaxPixels = None,
-    as_json: AsJson = False,
+    max_pixels: shared.MaxPixels = None,
+    as_json: shared.AsJson = False,
 ) -> int:
     """Write files for another program."""
     from pipeline.exchange.exchange_stage import run_export
 
-    done = run_export(read(project, max_pixels), format, out_dir, ExportOptions(pitch_um, lens, misfit_px))
-    show(
+    done = run_export(shared.read(project, max_pixels), format, out_dir, ExportOptions(pitch_um, lens, misfit_px))
+    shared.show(
         as_json,
         lambda: {
             "folder": str(out_dir),
@@ -88,18 +73,18 @@ def export(
             "notes": done.notes,
             "left_out": done.left_out,
         },
-        lambda _: say(done.readme_text, f"{out_dir}: {counted(len(done.files), 'file')}"),
+        lambda _: shared.say(done.readme_text, f"{out_dir}: {counted(len(done.files), 'file')}"),
     )
-    return LOOK if done.left_out else DONE
+    return shared.LOOK if done.left_out else shared.DONE
 
 
 def import_(
-    format: Annotated[str, typer.Argument(metavar="FORMAT", help=choices_help(IMPORTED), show_default=False)],
+    format: Annotated[str, typer.Argument(metavar="FORMAT", help=shared.choices_help(IMPORTED), show_default=False)],
     paths: Annotated[
         list[Path],
         typer.Argument(metavar="FILE... OUT_DIR", help="Files to read, and where the results go.", show_default=False),
     ],
-    pitch_um: Annotated[float | None, pitch_option("A pixel of the pictures.")] = None,
+    pitch_um: Annotated[float | None, shared.pitch_option("A pixel of the pictures.")] = None,
     sigma_px: Annotated[
         float | None,
         typer.Option("--sigma-px", metavar="PX", min=1e-6, help="Standard deviation of marks that have none."),
@@ -117,19 +102,19 @@ def import_(
         raise InputError("name at least one FILE, and then OUT_DIR: reseau import FORMAT FILE... OUT_DIR")
     *files, folder = paths
     done = run_import(format, files, folder, ImportOptions(pitch_um, sigma_px, from_middle, fiducials))
-    say(done.readme_text, f"{folder}: {counted(len(done.files), 'file')}")
-    print_next(
+    shared.say(done.readme_text, f"{folder}: {counted(len(done.files), 'file')}")
+    shared.print_next(
         False,
-        command_step("template project > project.toml", why=f"and name the files of {folder} in it"),
-        command_step("run", "project.toml"),
+        shared.command_step("template project > project.toml", why=f"and name the files of {folder} in it"),
+        shared.command_step("run", "project.toml"),
     )
-    return DONE
+    return shared.DONE
 
 
 def convert(
     file: Annotated[Path, typer.Argument(metavar="CAMERA.toml|adjustment.json", help="The lens.", show_default=False)],
-    family: Annotated[str, typer.Argument(metavar="FAMILY", help=choices_help(FAMILIES), show_default=False)],
-    out_dir: OutDir,
+    family: Annotated[str, typer.Argument(metavar="FAMILY", help=shared.choices_help(FAMILIES), show_default=False)],
+    out_dir: shared.OutDir,
     r0_mm: Annotated[
         float,
         typer.Option(
@@ -137,14 +122,13 @@ def convert(
         ),
     ] = 0.0,
     parameters: Annotated[
-        str,
-        typer.Option(metavar="A,B,...", help="Parameters of the other family to fit; by default the usual ones."),
+        str, typer.Option(metavar="A,B,...", help="Parameters of the other family to fit; by default the usual ones.")
     ] = "",
-    camera: OfCamera = None,
+    camera: shared.OfCamera = None,
     misfit_um: Annotated[
         float, typer.Option("--misfit-um", metavar="UM", min=0.0, help="How far the other family may be off.")
     ] = 0.1,
-    as_json: AsJson = False,
+    as_json: shared.AsJson = False,
 ) -> int:
     """Convert a lens into another distortion family."""
     from pipeline.exchange.convert_stage import ConvertOptions, run_convert
@@ -152,25 +136,25 @@ def convert(
     named = tuple(name.strip() for name in parameters.split(",") if name.strip())
     done = run_convert(file, out_dir, ConvertOptions(family, r0_mm, named, camera))
     files = f"{out_dir}: {counted(len(done.files), 'file')}"
-    show(as_json, done.as_json, lambda _: say(*done.lines(), files))
-    print_next(as_json, f'camera = "{out_dir / "camera.toml"}" in project.toml, then reseau run')
-    return LOOK if done.misfit_um > misfit_um else DONE
+    shared.show(as_json, done.as_json, lambda _: shared.say(*done.lines(), files))
+    shared.print_next(as_json, f'camera = "{out_dir / "camera.toml"}" in project.toml, then reseau run')
+    return shared.LOOK if done.misfit_um > misfit_um else shared.DONE
 
 
-def render(scene: SceneFile, out_dir: OutDir) -> int:
+def render(scene: shared.SceneFile, out_dir: shared.OutDir) -> int:
     """Render synthetic scans with their truth."""
     from pipeline.progress import Reporter
     from pipeline.rendered.scene_file import render_project
 
     with Reporter().stage("rendering strip") as count:
         render_project(scene, out_dir, count)
-    say(str(out_dir / "project.toml"))
-    print_next(False, command_step("run", out_dir / "project.toml"))
-    return DONE
+    shared.say(str(out_dir / "project.toml"))
+    shared.print_next(False, shared.command_step("run", out_dir / "project.toml"))
+    return shared.DONE
 
 
 def template(
-    kind: Annotated[str, typer.Argument(metavar="KIND", help=choices_help(TEMPLATES), show_default=False)],
+    kind: Annotated[str, typer.Argument(metavar="KIND", help=shared.choices_help(TEMPLATES), show_default=False)],
     marks: Annotated[
         str | None,
         typer.Option(metavar="KIND[,KIND]", help="Kinds of the marks in corners and side middles (template camera)."),
@@ -205,4 +189,4 @@ def template(
 
         text = resources.files("pipeline").joinpath("templates", f"{kind}.toml").read_text(encoding="utf-8")
     typer.echo(text, nl=False)
-    return DONE
+    return shared.DONE

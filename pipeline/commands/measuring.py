@@ -11,26 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pipeline.archive.verdicts import Verdict
-from pipeline.commands.shared import (
-    DONE,
-    LOOK,
-    AsJson,
-    MaxPixels,
-    ProjectFile,
-    Quiet,
-    command_step,
-    finish,
-    init_steps,
-    pitch_option,
-    print_next,
-    read,
-    report_step,
-    run_stage,
-    say,
-    show,
-    summary_steps,
-    verdict_steps,
-)
+from pipeline.commands import shared
 from pipeline.errors import InputError, missing_extra
 from pipeline.terminal import PlainConsole, plain
 from pipeline.text.files import no_such_file
@@ -40,20 +21,22 @@ if TYPE_CHECKING:
     from pipeline.files.project_file import Project
 
 PROJECT = "project.toml"
-LIBRARY_STEP = command_step("cameras NAME > camera.toml", why="a camera file to start from; or: reseau template camera")
+LIBRARY_STEP = shared.command_step(
+    "cameras NAME > camera.toml", why="a camera file to start from; or: reseau template camera"
+)
 
 
 def demo(
     folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where the demonstration goes.")] = Path(
         "reseau-demo"
     ),
-    as_json: AsJson = False,
+    as_json: shared.AsJson = False,
 ) -> int:
     """Render five film frames and run everything on them."""
     from pipeline.demo import run_demo
     from pipeline.progress import Reporter
 
-    return finish(run_demo(folder, Reporter()), as_json, folder / "project.toml")
+    return shared.finish(run_demo(folder, Reporter()), as_json, folder / "project.toml")
 
 
 def init(
@@ -66,9 +49,9 @@ def init(
         ),
     ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where project.toml and images.csv go.")] = Path(),
-    max_pixels: MaxPixels = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
+    max_pixels: shared.MaxPixels = None,
+    quiet: shared.Quiet = False,
+    as_json: shared.AsJson = False,
 ) -> int:
     """Write a project for a folder of scans, cameras named."""
     from measure.scans.remote import scan_path
@@ -76,10 +59,10 @@ def init(
     from pipeline.progress import Reporter
 
     new = init_project([scan_path(text) for text in scans], out, Reporter(quiet=quiet), max_pixels)
-    show(as_json, new.as_json, lambda console: print_new_project(new, console))
-    run_step = [command_step("run", new.folder / PROJECT)] if new.named else []
-    print_next(as_json, *init_steps(new), *run_step)
-    return LOOK if new.needs_review else DONE
+    shared.show(as_json, new.as_json, lambda console: print_new_project(new, console))
+    run_step = [shared.command_step("run", new.folder / PROJECT)] if new.named else []
+    shared.print_next(as_json, *shared.init_steps(new), *run_step)
+    return shared.LOOK if new.needs_review else shared.DONE
 
 
 Shard = Annotated[
@@ -113,9 +96,9 @@ def run(
     retry: Retry = False,
     moved: Moved = False,
     workers: Workers = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
-    max_pixels: MaxPixels = None,
+    quiet: shared.Quiet = False,
+    as_json: shared.AsJson = False,
+    max_pixels: shared.MaxPixels = None,
 ) -> int:
     """Measure, adjust, check and report.
 
@@ -140,26 +123,26 @@ def run(
         if not as_json:
             print_new_project(new, PlainConsole())
         if not new.named:
-            show(as_json, new.as_json, lambda _: None)
-            print_next(as_json, *init_steps(new))
-            return LOOK
-    summary = run_all(read(file, max_pixels), reporter, work)
+            shared.show(as_json, new.as_json, lambda _: None)
+            shared.print_next(as_json, *shared.init_steps(new))
+            return shared.LOOK
+    summary = run_all(shared.read(file, max_pixels), reporter, work)
     record = summary.as_json if new is None else lambda: {**summary.as_json(), "init": new.as_json()}
-    show(as_json, record, lambda console: print_summary(summary, console))
-    print_next(as_json, *(init_steps(new) if new else ()), *summary_steps(file, summary))
-    return max(summary.verdict.exit_code, LOOK) if new and new.needs_review else summary.verdict.exit_code
+    shared.show(as_json, record, lambda console: print_summary(summary, console))
+    shared.print_next(as_json, *(shared.init_steps(new) if new else ()), *shared.summary_steps(file, summary))
+    return max(summary.verdict.exit_code, shared.LOOK) if new and new.needs_review else summary.verdict.exit_code
 
 
 def measure(
-    project: ProjectFile,
+    project: shared.ProjectFile,
     shard: Shard = None,
     cluster: Cluster = None,
     retry: Retry = False,
     moved: Moved = False,
     workers: Workers = None,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
-    max_pixels: MaxPixels = None,
+    quiet: shared.Quiet = False,
+    as_json: shared.AsJson = False,
+    max_pixels: shared.MaxPixels = None,
 ) -> int:
     """Measure marks in the scans: comparator.csv.
 
@@ -169,16 +152,16 @@ def measure(
     from pipeline.workers import WorkOptions
 
     work = WorkOptions(_shard(shard), cluster, retry, moved, workers)
-    return run_stage(project, partial(run_measure, work=work), as_json, max_pixels, quiet)
+    return shared.run_stage(project, partial(run_measure, work=work), as_json, max_pixels, quiet)
 
 
 def status(
-    project: ProjectFile,
+    project: shared.ProjectFile,
     verdict: Annotated[
         Verdict | None, typer.Option(metavar="V", help=f"List the scans with this verdict: {', '.join(Verdict)}.")
     ] = None,
     as_csv: Annotated[bool, typer.Option("--csv", help="A line a scan, on stdout.")] = False,
-    as_json: AsJson = False,
+    as_json: shared.AsJson = False,
 ) -> int:
     """Count scans by verdict, with the next step for each."""
     from pipeline.archive.status import archive_status, print_status, status_csv, status_json
@@ -189,34 +172,36 @@ def status(
         else:
             print_status(shown, console, every=verdict is not None)
 
-    given = read(project)
+    given = shared.read(project)
     every = archive_status(given)
     shown = every.select(verdict)
-    show(as_json, partial(status_json, shown), printed)
-    print_next(as_json or as_csv, *verdict_steps(project, shown.counts), report_step(project, given.report_path))
-    return DONE if every.all_good else LOOK
+    shared.show(as_json, partial(status_json, shown), printed)
+    shared.print_next(
+        as_json or as_csv, *shared.verdict_steps(project, shown.counts), shared.report_step(project, given.report_path)
+    )
+    return shared.DONE if every.all_good else shared.LOOK
 
 
 def merge(
-    project: ProjectFile,
+    project: shared.ProjectFile,
     stores: Annotated[
         list[Path], typer.Argument(metavar="DB...", help="Results databases of the parts.", show_default=False)
     ],
-    as_json: AsJson = False,
+    as_json: shared.AsJson = False,
 ) -> int:
     """Join the results of several machines."""
     from pipeline.progress import Reporter
     from pipeline.stages import run_merge
 
-    taken, summary = run_merge(read(project), stores, Reporter())
+    taken, summary = run_merge(shared.read(project), stores, Reporter())
     if not as_json:
         left_out = {one.path: f", {one.damaged} damaged and left out" if one.damaged else "" for one in taken}
-        say(*(f"{o.path}: {counted(o.results, 'result')}, {o.new} of them new{left_out[o.path]}" for o in taken))
-    return finish(summary, as_json, project)
+        shared.say(*(f"{o.path}: {counted(o.results, 'result')}, {o.new} of them new{left_out[o.path]}" for o in taken))
+    return shared.finish(summary, as_json, project)
 
 
 def report(
-    project: ProjectFile,
+    project: shared.ProjectFile,
     names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", hidden=True, show_default=False)] = None,
     frames: Annotated[
         list[str] | None,
@@ -227,27 +212,29 @@ def report(
     plots: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write each camera's plots there as PNG and PDF (extra plots).")
     ] = None,
-    as_json: AsJson = False,
-    max_pixels: MaxPixels = None,
+    as_json: shared.AsJson = False,
+    max_pixels: shared.MaxPixels = None,
 ) -> int:
     """Write report.html, or a page of single frames."""
     from pipeline.progress import Reporter
     from pipeline.stages import run_frame_pages, run_plots, run_report
 
     if plots is not None:
-        run_plots(read(project, max_pixels), plots, Reporter())
+        run_plots(shared.read(project, max_pixels), plots, Reporter())
     if not frames:
         if names:
             raise InputError("images are named by --frames: reseau report PROJECT.toml --frames NAME --frames NAME")
-        return run_stage(project, run_report, as_json, max_pixels)
-    pages = run_frame_pages(read(project, max_pixels), list(dict.fromkeys([*frames, *(names or ())])), Reporter())
+        return shared.run_stage(project, run_report, as_json, max_pixels)
+    pages = run_frame_pages(
+        shared.read(project, max_pixels), list(dict.fromkeys([*frames, *(names or ())])), Reporter()
+    )
     page_by_image = {image: str(path) for image, path in pages.items()}
-    show(
+    shared.show(
         as_json,
         lambda: {"frames": page_by_image},
-        lambda _: say(*(f"{image}: {path}" for image, path in page_by_image.items())),
+        lambda _: shared.say(*(f"{image}: {path}" for image, path in page_by_image.items())),
     )
-    return DONE
+    return shared.DONE
 
 
 def review(
@@ -260,7 +247,7 @@ def review(
     port: Annotated[int, typer.Option(metavar="N", min=0, max=65535, help="Port, on this machine; 0: any free.")] = 0,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, and open no browser.")] = False,
     who: Annotated[str | None, typer.Option(metavar="NAME", help="Who decides; by default who is logged in.")] = None,
-    max_pixels: MaxPixels = None,
+    max_pixels: shared.MaxPixels = None,
 ) -> int:
     """Settle doubtful marks, or draw a camera, in the browser."""
     try:
@@ -273,14 +260,14 @@ def review(
     file = project / "project.toml" if project.is_dir() else project
     scans = find_scan_files([project])[0] if project.is_dir() and not file.exists() else ()
     given = replace(read_undrawn(file, scans), max_pixels=max_pixels)
-    step = command_step("run", file, why="applies the decisions")
+    step = shared.command_step("run", file, why="applies the decisions")
 
     def say_address(address: str) -> None:
         typer.echo(address)  # not by `say`, which would hide the token
-        print_next(False, "decide in the browser; end with Ctrl-C", *([] if scans else [step]))
+        shared.print_next(False, "decide in the browser; end with Ctrl-C", *([] if scans else [step]))
 
     serve(given, port, who, not no_browser, say_address)
-    return DONE
+    return shared.DONE
 
 
 def cameras(
@@ -299,7 +286,7 @@ def cameras(
         typer.Option("--project", metavar="PROJECT.toml", help="Try its camera files, too; its scans without --scan."),
     ] = None,
     pitch_um: Annotated[
-        float | None, pitch_option("The scan's pixel in µm, if its file does not say.", "--pitch")
+        float | None, shared.pitch_option("The scan's pixel in µm, if its file does not say.", "--pitch")
     ] = None,
     saved: Annotated[
         list[Path] | None,
@@ -312,14 +299,14 @@ def cameras(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Where --save writes; by default out/cameras.")
     ] = None,
-    max_pixels: MaxPixels = None,
-    as_json: AsJson = False,
+    max_pixels: shared.MaxPixels = None,
+    as_json: shared.AsJson = False,
 ) -> int:
     """List film cameras, print one, name a scan's camera, or save adjusted ones."""
     if saved:
-        return _save_cameras([read(one) for one in saved], out, as_json)
+        return _save_cameras([shared.read(one) for one in saved], out, as_json)
     if own is not None or scan is not None:
-        project = None if own is None else read(own)
+        project = None if own is None else shared.read(own)
         given = [*(scan or ()), *(Path(name) for name in names or ())] or (project.scans.values() if project else ())
         return _name_cameras(list(given), project, pitch_um, max_pixels, as_json)
     if (names and (as_json or len(names) > 1)) or pitch_um is not None:
@@ -329,9 +316,11 @@ def cameras(
     if names:
         typer.echo(library_path(names[0].removeprefix(PREFIX)).read_text(encoding="utf-8"), nl=False)
     else:
-        show(as_json, library_json, print_library)
-        print_next(as_json, command_step("init", "FOLDER", why="finds the camera of each scan"), LIBRARY_STEP)
-    return DONE
+        shared.show(as_json, library_json, print_library)
+        shared.print_next(
+            as_json, shared.command_step("init", "FOLDER", why="finds the camera of each scan"), LIBRARY_STEP
+        )
+    return shared.DONE
 
 
 def _save_cameras(projects: "Sequence[Project]", out: Path | None, as_json: bool) -> int:
@@ -339,9 +328,9 @@ def _save_cameras(projects: "Sequence[Project]", out: Path | None, as_json: bool
 
     cameras = save_cameras(projects, out or projects[0].output / "cameras")
     content = {one.name: {"file": str(one.path), "source": dataclasses.asdict(one.source)} for one in cameras}
-    show(as_json, lambda: {"cameras": content}, lambda _: say(*(one.sentence() for one in cameras)))
-    print_next(as_json, f'camera = "{cameras[0].path}" in a later project')
-    return DONE
+    shared.show(as_json, lambda: {"cameras": content}, lambda _: shared.say(*(one.sentence() for one in cameras)))
+    shared.print_next(as_json, f'camera = "{cameras[0].path}" in a later project')
+    return shared.DONE
 
 
 def _name_cameras(
@@ -358,21 +347,23 @@ def _name_cameras(
     tried, reporter = {**own, **read_library()}, Reporter()
     if len(given) == 1 and not given[0].is_dir():
         identification = identify(given[0], tried, pitch_um, reporter, max_pixels)
-        show(as_json, identification.as_json, lambda console: print_identification(identification, console))
+        shared.show(as_json, identification.as_json, lambda console: print_identification(identification, console))
         steps = [f'camera = "{PREFIX}{name}" in project.toml' for name in identification.names_by_plate()]
-        print_next(as_json, *(steps or [LIBRARY_STEP]))
-        return DONE if identification.best else LOOK
+        shared.print_next(as_json, *(steps or [LIBRARY_STEP]))
+        return shared.DONE if identification.best else shared.LOOK
     with reporter.stage("examining file") as count:
         found = catalogue(given, count, max_pixels, by_folder=False)
     trial = partial(identify_sample, cameras=tried, pitch_um=pitch_um, max_pixels=max_pixels)
     grouped = name_cameras(found, trial, reporter, None)
     if not grouped.groups:
         raise InputError("\n".join(grouped.unread.values()))
-    show(as_json, grouped.as_json, lambda console: print_groups(grouped, console))
+    shared.show(as_json, grouped.as_json, lambda console: print_groups(grouped, console))
     is_any_named = any(group.camera for group in grouped.groups)
-    step = command_step("init", *given, why="writes a project with these cameras") if is_any_named else LIBRARY_STEP
-    print_next(as_json, step)
-    return DONE if grouped.all_named else LOOK
+    step = (
+        shared.command_step("init", *given, why="writes a project with these cameras") if is_any_named else LIBRARY_STEP
+    )
+    shared.print_next(as_json, step)
+    return shared.DONE if grouped.all_named else shared.LOOK
 
 
 def _shard(text: str | None) -> tuple[int, int] | None:

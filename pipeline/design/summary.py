@@ -138,9 +138,7 @@ def _tables(design: Design) -> Iterator[PrintedTable]:
     expected, alone, layouts = design.expected, design.alone, design.layouts
     camera, plan = expected.camera, expected.plan
     yield _camera_table(design)
-    curve = [
-        (f"{at.radius_mm:.1f}", *map(_sigma, (at.radial_um, at.tangential_um, at.ray_um))) for at in expected.curve
-    ]
+    curve = [(f"{r.radius_mm:.1f}", *map(_sigma, (r.radial_um, r.tangential_um, r.ray_um))) for r in expected.curve]
     yield "Distortion, sigma in µm", ("radius, mm", "radial", "tangential", "image of a ray"), curve
     places = {id: [Parameter.fiducial(camera, id, axis) for axis in "xy"] for id in expected.fiducials}
     fiducials = [

@@ -29,9 +29,7 @@ def write_picture(path: Path, width: float, height: float, title: str, *content:
 
 def tag(name: str, *content: str, **attributes: object) -> Markup:
     """SVG element; underscores in attribute names become hyphens, a trailing one (class_) is removed."""
-    pairs = "".join(
-        f' {key.rstrip("_").replace("_", "-")}="{escape(_text(value))}"' for key, value in attributes.items()
-    )
+    pairs = "".join(f' {key.rstrip("_").replace("_", "-")}="{escape(_text(v))}"' for key, v in attributes.items())
     inside = "".join(str(escape(item)) for item in content)
     return Markup(f"<{name}{pairs}>{inside}</{name}>")
 

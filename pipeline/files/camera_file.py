@@ -16,14 +16,7 @@ from adjust.problem.camera import Camera, Fiducial, FiducialDistance
 from measure.marks import shapes
 from measure.marks.rendering import extent_px
 from pipeline.errors import InputError
-from pipeline.files.camera_tables import (
-    DEFAULT_SIGMA_MM,
-    CameraTable,
-    ClicksTable,
-    FiducialDistanceTable,
-    Source,
-    written_place_text,
-)
+from pipeline.files import camera_tables
 from pipeline.files.earlier_calibration import EarlierCalibration, read_calibration
 from pipeline.files.mark_table import Clicks, Drawing, LearnedFrom, SavePicture, read_marks, template_values
 from pipeline.text.files import SMALLEST_SIGMA, FilePath, image_name
@@ -139,7 +132,7 @@ class CameraFile:
     number: str = ""
     writing: tuple[shapes.WrittenPlace, ...] = ()
     calibration: EarlierCalibration | None = None
-    source: Source | None = None
+    source: camera_tables.Source | None = None
     clicks: Clicks | None = None
     learned_from: LearnedFrom | None = None
     distances: tuple[FiducialDistance, ...] = ()
@@ -216,10 +209,10 @@ def parse_camera(table: Table) -> CameraFile:
             "data_strip",
             'has become writing, which also says how it reads: writing = ["left: reads upward"], or "left".',
         )
-    given = read_model(table, CameraTable)
+    given = read_model(table, camera_tables.CameraTable)
     entries = table.tables("fiducial")
     fiducials = _fiducials(entries, given, read_marks(table.table("mark")))
-    default_sigma = DEFAULT_SIGMA_MM if fiducials else math.inf
+    default_sigma = camera_tables.DEFAULT_SIGMA_MM if fiducials else math.inf
     point, point_sigma = _default_principal_point(fiducials)
     if given.principal_point_mm is not None:
         point, point_sigma = given.principal_point_mm, default_sigma
@@ -250,7 +243,7 @@ def parse_camera(table: Table) -> CameraFile:
 
 
 def _fiducials(
-    entries: Sequence[Table], given: CameraTable, drawings: Mapping[str, Drawing]
+    entries: Sequence[Table], given: camera_tables.CameraTable, drawings: Mapping[str, Drawing]
 ) -> tuple[GivenFiducial, ...]:
     """Fiducials with their drawings. Raises InputError where two share a name or place, or a drawing is missing."""
     fiducials: dict[str, GivenFiducial] = {}
@@ -276,7 +269,7 @@ def _fiducials(
     return tuple(fiducials.values())
 
 
-def _clicks(table: Table, given: ClicksTable, learned: Sequence[str]) -> Clicks:
+def _clicks(table: Table, given: camera_tables.ClicksTable, learned: Sequence[str]) -> Clicks:
     """Clicks on learned marks. Raises InputError where some of them are not clicked, or others are."""
     if unknown := table.table("px").unknown_keys(learned):
         raise InputError("\n".join(unknown))
@@ -289,7 +282,7 @@ def _clicks(table: Table, given: ClicksTable, learned: Sequence[str]) -> Clicks:
 
 
 def fiducial_distances(
-    entries: Sequence[Table], given: Sequence[FiducialDistanceTable], ids: Sequence[str]
+    entries: Sequence[Table], given: Sequence[camera_tables.FiducialDistanceTable], ids: Sequence[str]
 ) -> tuple[FiducialDistance, ...]:
     """Distances between fiducials of these ids. Raises InputError, with the key, for other ids."""
     for entry, one in zip(entries, given, strict=True):
@@ -325,11 +318,11 @@ def _default_principal_point(fiducials: Sequence[GivenFiducial]) -> tuple[tuple[
     xy = np.array([fiducial.xy_mm for fiducial in fiducials])
     middle, extent = (xy.min(axis=0) + xy.max(axis=0)) / 2, np.ptp(xy, axis=0).max()
     if len(fiducials) < _FEWEST_ABOUT_ORIGIN or np.abs(middle).max() < _OFF_MIDDLE * extent:
-        return (0.0, 0.0), DEFAULT_SIGMA_MM
+        return (0.0, 0.0), camera_tables.DEFAULT_SIGMA_MM
     return (float(middle[0]), float(middle[1])), math.inf
 
 
-def _distortion(table: Table, camera: CameraTable) -> Distortion:
+def _distortion(table: Table, camera: camera_tables.CameraTable) -> Distortion:
     given = camera.distortion
     known = parameter_names(given.family)
     half_mm = given.half_mm or (0.0, 0.0)
@@ -365,7 +358,7 @@ def camera_text(camera: CameraFile, save: SavePicture) -> str:
         "name": camera.name,
         "frame_mm": camera.frame_mm,
         "number": camera.number or None,
-        "writing": [written_place_text(place) for place in camera.writing] or None,
+        "writing": [camera_tables.written_place_text(place) for place in camera.writing] or None,
         "principal_distance_mm": camera.principal_distance_mm,
         "principal_point_mm": camera.principal_point_mm,
         "sigma": {

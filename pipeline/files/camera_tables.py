@@ -11,21 +11,8 @@ from adjust.functional_model.families import FAMILY_NAMES, family
 from adjust.functional_model.lens import Decentering
 from measure.marks import shapes
 from pipeline.files.mark_table import LearnedFrom
-from pipeline.text.table_models import (
-    FilePath,
-    Key,
-    NotNegative,
-    NumberOrPair,
-    Positive,
-    Sigma,
-    SigmaPair,
-    Values,
-    WrongKey,
-    pair,
-    table_model,
-    text,
-    texts,
-)
+from pipeline.text import table_models as models
+from pipeline.text.table_models import text
 from pipeline.text.wording import did_you_mean
 
 DEFAULT_SIGMA_MM = 1.0  # Torlegård's a-priori standard deviation for a prior that only fixes the datum
@@ -36,7 +23,7 @@ _WRITTEN = re.compile(
 
 
 def _frame(value: Any) -> shapes.Point:
-    width, height = pair(value)
+    width, height = models.pair(value)
     if min(width, height) <= 0.0:
         raise ValueError(f"must be two positive lengths, [width, height], not {[width, height]}.")
     return width, height
@@ -51,7 +38,7 @@ def _number(value: Any) -> str:
 def _writing(value: Any) -> tuple[shapes.WrittenPlace, ...]:
     """Places such as "left: reads upward", "right: plate reads downward", or "left" where the direction is unknown."""
     places = []
-    for place in texts(value):
+    for place in models.texts(value):
         match = _WRITTEN.fullmatch(place.strip())
         if match is None:
             raise ValueError(
@@ -84,7 +71,7 @@ def _family(value: Any) -> str:
     return str(value)
 
 
-@table_model
+@models.table_model
 class Source:
     """[source] of a camera file: where its numbers come from, and the number of calibration reports or frames behind
     them."""
@@ -94,32 +81,36 @@ class Source:
     frames: Annotated[int, "How many frames were adjusted."] = 0
     scanners: Annotated[int, "Of how many scanners."] = 0
     archives: Annotated[int, "In how many projects."] = 0
-    spread_mm: Annotated[Mapping[str, NotNegative], "Standard deviation between archives, beyond their own."] = field(
-        default_factory=dict
+    spread_mm: Annotated[Mapping[str, models.NotNegative], "Standard deviation between archives, beyond their own."] = (
+        field(default_factory=dict)
     )
 
 
-@table_model
+@models.table_model
 class SigmaTable:
     """[sigma] of a camera file."""
 
-    principal_distance_mm: Annotated[Sigma | None, "Absent: 1 with fiducials, else free."] = None
-    principal_point_mm: Annotated[SigmaPair | None, "Absent: as the principal distance."] = None
-    calibration: Annotated[FilePath | None, "adjustment.json of an earlier calibration, with its covariance."] = None
+    principal_distance_mm: Annotated[models.Sigma | None, "Absent: 1 with fiducials, else free."] = None
+    principal_point_mm: Annotated[models.SigmaPair | None, "Absent: as the principal distance."] = None
+    calibration: Annotated[
+        models.FilePath | None, "adjustment.json of an earlier calibration, with its covariance."
+    ] = None
     calibration_fiducials: Annotated[bool, "Whether the earlier calibration says where the fiducials are."] = True
 
 
-@table_model
+@models.table_model
 class DistortionTable:
     """[distortion] of a camera file."""
 
-    family: Annotated[str, Key("name of a family", _family), "Distortion model."] = "none"
+    family: Annotated[str, models.Key("name of a family", _family), "Distortion model."] = "none"
     decentering: Annotated[Decentering, "Decentering terms of torlegard."] = "reduced"
-    r0_mm: Annotated[NotNegative, "Radius of no distortion."] = 0.0
-    r0_dm: Annotated[Positive | None, "The same of juhl."] = None
-    half_mm: Annotated[NumberOrPair | None, "Unit of length of self-calibration sets; absent: half of frame_mm."] = None
+    r0_mm: Annotated[models.NotNegative, "Radius of no distortion."] = 0.0
+    r0_dm: Annotated[models.Positive | None, "The same of juhl."] = None
+    half_mm: Annotated[
+        models.NumberOrPair | None, "Unit of length of self-calibration sets; absent: half of frame_mm."
+    ] = None
     value: Annotated[Mapping[str, float], "Values of the parameters; absent: 0."] = field(default_factory=dict)
-    sigma: Annotated[Mapping[str, Sigma], "Of the parameters; absent: fixed; all: of every parameter."] = field(
+    sigma: Annotated[Mapping[str, models.Sigma], "Of the parameters; absent: fixed; all: of every parameter."] = field(
         default_factory=dict
     )
 
@@ -129,37 +120,37 @@ class DistortionTable:
         has_half = family(self.family).needs == "half_mm"
         for key, is_wrong in (("r0_mm", in_dm), ("r0_dm", not in_dm), ("half_mm", not has_half)):
             if is_wrong and getattr(self, key):
-                raise WrongKey(key, f"is no key of this table where the family is {self.family}. Take it out.")
+                raise models.WrongKey(key, f"is no key of this table where the family is {self.family}. Take it out.")
         if in_dm and self.r0_dm is None:
-            raise WrongKey("r0_dm", "is missing. Add it.")
+            raise models.WrongKey("r0_dm", "is missing. Add it.")
         if self.half_mm is not None and min(self.half_mm) <= 0.0:
-            raise WrongKey("half_mm", f"must be positive, not {list(self.half_mm)}.")
+            raise models.WrongKey("half_mm", f"must be positive, not {list(self.half_mm)}.")
 
 
-@table_model
+@models.table_model
 class FiducialTable:
     """[[fiducial]] of a camera file."""
 
-    id: Annotated[str, Key("text", _fiducial_id), "Name of the mark."]
+    id: Annotated[str, models.Key("text", _fiducial_id), "Name of the mark."]
     xy_mm: Annotated[shapes.Point, "Given coordinates."]
-    sigma_mm: Annotated[SigmaPair, "Of the given coordinates."] = (DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM)
+    sigma_mm: Annotated[models.SigmaPair, "Of the given coordinates."] = (DEFAULT_SIGMA_MM, DEFAULT_SIGMA_MM)
     mark: Annotated[str | None, 'Name of a table [mark.NAME], or "none" to pass it over.'] = None
     template_origin_mm: Annotated[
         shapes.Point | None, Field(alias="seen_mm"), "Of a learned mark: where its template has its origin."
     ] = None
 
 
-@table_model
+@models.table_model
 class FiducialDistanceTable:
     """[[fiducial_distance]] of a camera file."""
 
     start: Annotated[str, Field(alias="from"), "Name of a mark."]
     end: Annotated[str, Field(alias="to"), "Name of another."]
-    mm: Annotated[Positive, "Distance between them."]
-    sigma_mm: Annotated[Positive, "Its standard deviation."]
+    mm: Annotated[models.Positive, "Distance between them."]
+    sigma_mm: Annotated[models.Positive, "Its standard deviation."]
 
 
-@table_model
+@models.table_model
 class ClicksTable:
     """[clicks] of a camera file."""
 
@@ -167,18 +158,18 @@ class ClicksTable:
     px: Annotated[Mapping[str, tuple[float, float]], "Columns and rows by fiducial."]
 
 
-@table_model
+@models.table_model
 class CameraTable:
     """camera.toml."""
 
     name: Annotated[str | None, "Absent: as the file."] = None
-    frame_mm: Annotated[shapes.Point | None, Key("[width, height]", _frame), "Of the exposed frame."] = None
-    principal_distance_mm: Annotated[Positive | None, "Absent: found from the points."] = None
+    frame_mm: Annotated[shapes.Point | None, models.Key("[width, height]", _frame), "Of the exposed frame."] = None
+    principal_distance_mm: Annotated[models.Positive | None, "Absent: found from the points."] = None
     principal_point_mm: Annotated[shapes.Point | None, "Absent: the origin, where fiducials lie about it."] = None
-    number: Annotated[str, Key("digits", _number), "Of the camera or its cone, as its plate has it."] = ""
+    number: Annotated[str, models.Key("digits", _number), "Of the camera or its cone, as its plate has it."] = ""
     writing: Annotated[
         tuple[shapes.WrittenPlace, ...],
-        Key("list of places", _writing),
+        models.Key("list of places", _writing),
         'Where the camera writes on its film, as "left: reads upward".',
     ] = ()
     sigma: Annotated[SigmaTable, "Prior standard deviations."] = SigmaTable()
@@ -187,7 +178,7 @@ class CameraTable:
     fiducial_distance: Annotated[
         tuple[FiducialDistanceTable, ...], "Measured distances between fiducials: from, to, mm, sigma_mm."
     ] = ()
-    mark: Annotated[Values, "Drawings of the marks."] = field(default_factory=dict)
+    mark: Annotated[models.Values, "Drawings of the marks."] = field(default_factory=dict)
     source: Annotated[Source | None, "Where the numbers come from."] = None
     clicks: Annotated[ClicksTable | None, "Clicked places of marks to be learned."] = None
     learned_from: Annotated[LearnedFrom | None, "As the program writes it with learned marks."] = None

@@ -108,10 +108,7 @@ def _entry(name: str, camera: CameraFile) -> Json:
         "title": camera.name,
         "frame_mm": list(camera.frame_mm or ()),
         "writing": [written_place_text(place) for place in camera.writing],
-        "principal_distance_mm": {
-            "value": camera.principal_distance_mm,
-            "sigma": camera.principal_distance_sigma_mm,
-        },
+        "principal_distance_mm": {"value": camera.principal_distance_mm, "sigma": camera.principal_distance_sigma_mm},
         "fiducials": len(camera.fiducials),
         "drawn": [mark.id for mark in camera.layout_marks],
         "learned": [one.id for one in camera.learned],
@@ -235,9 +232,7 @@ class CameraSizes:
     def kinds(self) -> dict[str, tuple[str, Point]]:
         """{"square" or "side": (kind of the marks, their distances in mm)}."""
         given = [(place, size) for place, size in (("square", self.square), ("side", self.side)) if size]
-        return {
-            place: (self.marks[min(number, len(self.marks) - 1)], size) for number, (place, size) in enumerate(given)
-        }
+        return {place: (self.marks[min(i, len(self.marks) - 1)], size) for i, (place, size) in enumerate(given)}
 
     @property
     def scale(self) -> float:

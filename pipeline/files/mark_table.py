@@ -15,19 +15,8 @@ from measure.errors import MeasurementError
 from measure.geometry import POSES
 from measure.marks import shapes
 from measure.marks.shapes import MarkTemplate, Point
+from pipeline.text import table_models as models
 from pipeline.text.files import write_atomically
-from pipeline.text.table_models import (
-    Entries,
-    FilePath,
-    Key,
-    NotNegative,
-    Positive,
-    WrongKey,
-    choice,
-    points,
-    read_kind,
-    table_model,
-)
 from pipeline.text.tables import Table
 from pipeline.types import Array
 
@@ -42,7 +31,7 @@ _ANY_CORNER = (-1.0, -1.0)  # placeholder: the fiducial's place determines the q
 
 
 def _vertices(value: Any) -> tuple[Point, ...]:
-    vertices = points(value)
+    vertices = models.points(value)
     if len(vertices) < 3:
         raise ValueError(f"a polygon needs at least three vertices, not {len(vertices)}.")
     x, y = np.transpose(vertices)
@@ -52,14 +41,14 @@ def _vertices(value: Any) -> tuple[Point, ...]:
 
 
 def _true_mm(value: Any) -> tuple[Point, ...]:
-    corners = points(value)
+    corners = models.points(value)
     if len(corners) != 2 or not np.all(np.less(*corners)):
         corner = "[[least x, least y], [greatest x, greatest y]]"
         raise ValueError(f"must be two corners of the rectangle in which the drawing is true, {corner}.")
     return corners
 
 
-Vertices = Annotated[tuple[Point, ...], Key("list of [x, y]", _vertices), "Corners in the order of the outline."]
+Vertices = Annotated[tuple[Point, ...], models.Key("list of [x, y]", _vertices), "Corners in the order of the outline."]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +69,7 @@ class Clicks:
     who: str = ""
 
 
-@table_model
+@models.table_model
 class LearnedFrom:
     """[learned_from] of a camera file.
 
@@ -96,7 +85,7 @@ class LearnedFrom:
 
     scan: str
     sha256: str
-    pose: Annotated[str, choice(*POSES)]
+    pose: Annotated[str, models.choice(*POSES)]
     clicked: bool = False
     alike: tuple[str, ...] = ()
 
@@ -163,12 +152,12 @@ def read_marks(table: Table) -> dict[str, Drawing]:
     marks = {}
     for name in table.values:
         entry = table.table(name)
-        given = read_kind(entry, MARK_TABLES)
+        given = models.read_kind(entry, MARK_TABLES)
         marks[name] = given.mark(entry), given.rotate == "radial"
     return marks
 
 
-@table_model
+@models.table_model
 class MarkTable(ABC):
     """Keys of every table [mark.NAME]."""
 
@@ -182,29 +171,31 @@ class MarkTable(ABC):
         """Mark of the table. table: for messages."""
 
 
-@table_model
+@models.table_model
 class LearnedTable(MarkTable):
     """Mark to be learned from the scans."""
 
-    size_mm: Annotated[Positive, "Width of the template."]
+    size_mm: Annotated[models.Positive, "Width of the template."]
 
     def mark(self, table: Table) -> shapes.LearnedMark:
         return shapes.LearnedMark(self.size_mm)
 
 
-@table_model
+@models.table_model
 class PaintedTable(MarkTable):
     """Mark that is lighter or darker than its background."""
 
     polarity: Annotated[shapes.Polarity, "Whether the mark is lighter than its background."] = "auto"
 
 
-@table_model
+@models.table_model
 class FrameCornerTable(PaintedTable):
     """Corner of the exposed frame."""
 
-    reach_mm: Annotated[NotNegative, "How far along its edges it is measured; 0: a sixth of half the frame."] = 0.0
-    radius_mm: Annotated[NotNegative, "Of a rounded corner."] = 0.0
+    reach_mm: Annotated[models.NotNegative, "How far along its edges it is measured; 0: a sixth of half the frame."] = (
+        0.0
+    )
+    radius_mm: Annotated[models.NotNegative, "Of a rounded corner."] = 0.0
 
     def mark(self, table: Table) -> shapes.Mark:
         if self.radius_mm and self.reach_mm and self.radius_mm >= self.reach_mm:
@@ -214,18 +205,18 @@ class FrameCornerTable(PaintedTable):
         return shapes.frame_corner(_ANY_CORNER, self.reach_mm, self.radius_mm, self.polarity)
 
 
-@table_model
+@models.table_model
 class LearnedPicture:
     """[mark.NAME.learned]: properties of a template estimated from scans, as the program writes them."""
 
-    size_mm: Positive
-    range_dn: Positive
-    noise_dn: NotNegative
-    slope_noise_dn: NotNegative = 0.0
+    size_mm: models.Positive
+    range_dn: models.Positive
+    noise_dn: models.NotNegative
+    slope_noise_dn: models.NotNegative = 0.0
     alike: tuple[str, ...] = ()
-    steadiness: FilePath | None = None
-    steady: FilePath | None = None
-    shares: Mapping[str, Positive] = dataclasses.field(default_factory=dict)
+    steadiness: models.FilePath | None = None
+    steady: models.FilePath | None = None
+    shares: Mapping[str, models.Positive] = dataclasses.field(default_factory=dict)
 
     def applied(self, template: MarkTemplate, table: Table) -> MarkTemplate:
         """Template with its learned properties."""
@@ -258,15 +249,15 @@ def _image(table: Table, key: str) -> Array:
         raise table.error(key, str(error)) from error
 
 
-@table_model
+@models.table_model
 class TemplateTable(PaintedTable):
     """Chip cut from a scan."""
 
-    image: Annotated[FilePath, "The chip."]
-    pitch_um: Annotated[Positive, "Of its pixels."]
+    image: Annotated[models.FilePath, "The chip."]
+    pitch_um: Annotated[models.Positive, "Of its pixels."]
     origin_px: Annotated[Point, "Column and row of the point that is measured."]
     turn_deg: Annotated[float, "By which the chip is turned."] = 0.0
-    detail_mm: Annotated[NotNegative, "Size of its finest detail."] = 0.0
+    detail_mm: Annotated[models.NotNegative, "Size of its finest detail."] = 0.0
     learned: Annotated[LearnedPicture | None, "As the program writes it."] = None
 
     def mark(self, table: Table) -> MarkTemplate:
@@ -287,13 +278,13 @@ class TemplateTable(PaintedTable):
         return self.learned.applied(template, table.table("learned")) if self.learned else template
 
 
-@table_model
+@models.table_model
 class DrawnTable(PaintedTable):
     """Mark drawn by its dimensions."""
 
     true_mm: Annotated[
         tuple[Point, Point] | None,
-        Key("[[x, y], [x, y]]", _true_mm),
+        models.Key("[[x, y], [x, y]]", _true_mm),
         "Corners of the rectangle in which the drawing is true; absent: everywhere.",
     ] = None
 
@@ -305,25 +296,25 @@ class DrawnTable(PaintedTable):
         """Primitive shapes of the mark. table: for messages."""
 
 
-@table_model
+@models.table_model
 class DotTable(DrawnTable):
     """Disk."""
 
-    radius_mm: Annotated[Positive, "Of the disk."]
+    radius_mm: Annotated[models.Positive, "Of the disk."]
 
     def parts(self, table: Table) -> tuple[shapes.Part, ...]:
         return shapes.dot(self.radius_mm)
 
 
-@table_model
+@models.table_model
 class RingTable(DrawnTable):
     """Mark with a ring."""
 
-    ring_mm: Annotated[Positive, "Mean radius of the ring."]
-    ring_line_mm: Annotated[Positive, "Width of the ring."]
+    ring_mm: Annotated[models.Positive, "Mean radius of the ring."]
+    ring_line_mm: Annotated[models.Positive, "Width of the ring."]
 
 
-@table_model
+@models.table_model
 class RingDotTable(RingTable, DotTable):
     """Disk in a ring."""
 
@@ -331,26 +322,26 @@ class RingDotTable(RingTable, DotTable):
         return shapes.ring_dot(self.ring_mm, self.ring_line_mm, self.radius_mm)
 
 
-@table_model
+@models.table_model
 class CrossTable(DrawnTable):
     """Cross."""
 
-    arm_mm: Annotated[Positive, "Half its length."]
-    line_mm: Annotated[Positive, "Width of its bars."]
-    gap_mm: Annotated[NotNegative, "Half the gap in its middle."] = 0.0
+    arm_mm: Annotated[models.Positive, "Half its length."]
+    line_mm: Annotated[models.Positive, "Width of its bars."]
+    gap_mm: Annotated[models.NotNegative, "Half the gap in its middle."] = 0.0
     angle_deg: Annotated[float, "0 upright, 45 diagonal."] = 0.0
 
     def __post_init__(self) -> None:
         """Raises WrongKey for a gap that leaves no arm."""
         if self.gap_mm >= self.arm_mm:
             message = f"must be smaller than arm_mm ({self.arm_mm:g}), not {self.gap_mm:g}: no arm would be left."
-            raise WrongKey("gap_mm", message)
+            raise models.WrongKey("gap_mm", message)
 
     def parts(self, table: Table) -> tuple[shapes.Part, ...]:
         return shapes.cross(self.arm_mm, self.line_mm, self.gap_mm, self.angle_deg)
 
 
-@table_model
+@models.table_model
 class RingCrossTable(RingTable, CrossTable):
     """Cross in a ring."""
 
@@ -359,7 +350,7 @@ class RingCrossTable(RingTable, CrossTable):
         return shapes.ring_cross(self.ring_mm, self.ring_line_mm, *sizes)
 
 
-@table_model
+@models.table_model
 class PolygonTable(DrawnTable):
     """Wedge, notch or wing."""
 
@@ -369,11 +360,11 @@ class PolygonTable(DrawnTable):
         return shapes.polygon(self.vertices_mm)
 
 
-@table_model
+@models.table_model
 class PartsTable(DrawnTable):
     """Combination of disks, rings, bars and polygons."""
 
-    part: Annotated[Entries, "The simple shapes, one table each."]
+    part: Annotated[models.Entries, "The simple shapes, one table each."]
 
     def parts(self, table: Table) -> tuple[shapes.Part, ...]:
         if not self.part:
@@ -394,32 +385,32 @@ MARK_TABLES: Mapping[str, type[MarkTable]] = {
 }
 
 
-@table_model
+@models.table_model
 class _Disk(shapes.Disk):
     shape: str
-    radius_mm: Positive
+    radius_mm: models.Positive
     center_mm: Point = (0.0, 0.0)
 
 
-@table_model
+@models.table_model
 class _Ring(shapes.Ring):
     shape: str
-    radius_mm: Positive
-    line_mm: Positive
+    radius_mm: models.Positive
+    line_mm: models.Positive
     center_mm: Point = (0.0, 0.0)
 
 
-@table_model
+@models.table_model
 class _Bar(shapes.Bar):
     shape: str
-    line_mm: Positive
+    line_mm: models.Positive
 
     def __post_init__(self) -> None:
         if self.from_mm == self.to_mm:
-            raise WrongKey("to_mm", "is the same as from_mm: a bar needs two different ends.")
+            raise models.WrongKey("to_mm", "is the same as from_mm: a bar needs two different ends.")
 
 
-@table_model
+@models.table_model
 class _Polygon(shapes.Polygon):
     shape: str
     vertices_mm: Vertices
@@ -430,7 +421,7 @@ _PARTS = {"disk": _Disk, "ring": _Ring, "bar": _Bar, "polygon": _Polygon}
 
 def _part(table: Table) -> shapes.Part:
     """Read a part as the class of `shapes` from which its model is derived."""
-    given: Any = read_kind(table, _PARTS, "shape")
+    given: Any = models.read_kind(table, _PARTS, "shape")
     plain: type[shapes.Part] = type(given).__bases__[0]
     return plain(**{field.name: getattr(given, field.name) for field in dataclasses.fields(plain)})
 

@@ -236,9 +236,7 @@ def fill_images(path: Path, values: Mapping[str, Mapping[str, str]]) -> None:
             header = [cell.strip() for cell in cells]
             continue
         own = values.get(image_name(cells[header.index("image")]), {})
-        filled = [
-            own.get(column, "") if not cell.strip() else cell for column, cell in zip(header, cells, strict=False)
-        ]
+        filled = [own.get(name, "") if not cell.strip() else cell for name, cell in zip(header, cells, strict=False)]
         if filled != cells[: len(header)]:
             written = io.StringIO()
             csv.writer(written, lineterminator=line[len(body) :]).writerow([*filled, *cells[len(header) :]])

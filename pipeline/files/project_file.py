@@ -13,19 +13,12 @@ from adjust.functional_model.lens import Prior
 from adjust.problem.network import ObjectPoint
 from measure.fiducials.options import ANY_FILM, BelievedFilm, Reads
 from pipeline.errors import InputError
+from pipeline.files import object_files
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.decisions_file import FILE as DECISIONS
 from pipeline.files.decisions_file import Decision, cut_short_line, decisions_bytes, learned_from, parse_decisions
 from pipeline.files.library import PREFIX, camera_path
 from pipeline.files.mark_table import Clicks
-from pipeline.files.object_files import (
-    GivenDistance,
-    GivenImages,
-    GivenPoints,
-    read_distances,
-    read_images,
-    read_points,
-)
 from pipeline.files.project_tables import UNITS_MM, AdjustSettings, ProjectTable
 from pipeline.files.scan_files import FoundScans, add_cuts, as_named, find_scans
 from pipeline.files.target_table import TargetSettings, TieSettings, read_targets
@@ -87,9 +80,9 @@ class Project:
     tone: float | str
     targets: TargetSettings | None
     ties: TieSettings | None
-    given_points: GivenPoints | None
-    given_images: GivenImages | None
-    given_distances: tuple[GivenDistance, ...]
+    given_points: object_files.GivenPoints | None
+    given_images: object_files.GivenImages | None
+    given_distances: tuple[object_files.GivenDistance, ...]
     unit_mm: float
     adjust: AdjustSettings
     max_pixels: int | None = None
@@ -285,7 +278,7 @@ def _read_tables(table: Table, needs_camera: bool = True) -> Project:
         raise objects.error("antenna_offset", 'goes with images = "...", the file of the observed stations. Give both.')
     lacks_camera = not (needs_camera or given.camera.startswith(PREFIX) or (folder / given.camera).exists())
     _check_named(table, objects, "" if lacks_camera else given.camera, named)
-    images = read_images(named["images"], antenna) if "images" in named else None
+    images = object_files.read_images(named["images"], antenna) if "images" in named else None
     found = FoundScans({}, frozenset())
     if given.scans is not None:
         found = find_scans(table, given.scans, given.exclude)
@@ -302,9 +295,9 @@ def _read_tables(table: Table, needs_camera: bool = True) -> Project:
         tone=given.measure.tone,
         targets=None if given.targets is None else read_targets(table.table("targets")),
         ties=given.ties,
-        given_points=read_points(named["points"]) if "points" in named else None,
+        given_points=object_files.read_points(named["points"]) if "points" in named else None,
         given_images=images,
-        given_distances=read_distances(named["distances"]) if "distances" in named else (),
+        given_distances=object_files.read_distances(named["distances"]) if "distances" in named else (),
         images_path=named.get("images"),
         unit_mm=UNITS_MM[given.object.unit],
         adjust=given.adjust,
@@ -416,7 +409,7 @@ def _check_written(table: Table, project: Project, named: Mapping[str, Path]) ->
         places[path.resolve()] = f"another result, {path}"
 
 
-def _cameras(table: Table, default: str, images: GivenImages | None) -> Mapping[str, CameraFile]:
+def _cameras(table: Table, default: str, images: object_files.GivenImages | None) -> Mapping[str, CameraFile]:
     folder = table.file.parent
     names = [default, *sorted({name for name in images.camera.values() if name} if images else set())]
     cameras = {name: read_camera(camera_path(name, folder)) for name in dict.fromkeys(names)}

@@ -443,9 +443,7 @@ def _same_model_agrees(problem: BareProblem, conversion: Converted, opencv: Open
     if not solved.converged:
         return False
     rows = _rows(NAMES, same.freedom, converted(same, solved), solved.sigma0, opencv)
-    return all(
-        row.difference_sigmas < SAME_MODEL_DIFFERENCE and _sigma_ratio(row) < SAME_MODEL_SIGMA_RATIO for row in rows
-    )
+    return all(r.difference_sigmas < SAME_MODEL_DIFFERENCE and _sigma_ratio(r) < SAME_MODEL_SIGMA_RATIO for r in rows)
 
 
 def _departures(adjustment: Adjustment, solved: Adjustment, camera: Camera) -> dict[str, float]:

@@ -15,16 +15,7 @@ from pipeline.files.camera_file import CameraFile, parse_camera, read_camera
 from pipeline.files.library import camera_path
 from pipeline.rendered.scene_project import Given, SceneFile, write_project
 from pipeline.rendered.scene_tables import DesignSettings, read_field
-from pipeline.text.table_models import (
-    Key,
-    NotNegative,
-    NumberOrPair,
-    Values,
-    choice,
-    number_or_word,
-    read_model,
-    table_model,
-)
+from pipeline.text import table_models as models
 from pipeline.text.tables import Table, read_toml
 from synthetic_images import areas, scene
 from synthetic_images.render import Progress, render_scene
@@ -64,75 +55,75 @@ def read_scene(path: Path) -> SceneFile:
     return parse_scene(read_toml(path))
 
 
-@table_model
+@models.table_model
 class FilmTable(scene.Film):
     """[film] of a scene: the film, and standard deviations of the random film transformation of each frame."""
 
     kind: Annotated[scene.FilmKind, Field(alias="transformation")] = "affine"
-    scale_sigma_ppm: NotNegative = 0.0
-    shear_sigma_urad: NotNegative = 0.0
+    scale_sigma_ppm: models.NotNegative = 0.0
+    shear_sigma_urad: models.NotNegative = 0.0
 
 
-@table_model
+@models.table_model
 class ScanTable(scene.Scanner):
     """[scan] of a scene: the scanner, and standard deviations of the random position of each frame on it."""
 
-    pitch_um: NumberOrPair
-    tone: Annotated[float | str, number_or_word(*scene.TONES)] = 1.0
-    turn_sigma_deg: NotNegative = 0.0
-    offset_sigma_mm: NotNegative = 0.0
+    pitch_um: models.NumberOrPair
+    tone: Annotated[float | str, models.number_or_word(*scene.TONES)] = 1.0
+    turn_sigma_deg: models.NotNegative = 0.0
+    offset_sigma_mm: models.NotNegative = 0.0
 
 
-@table_model
+@models.table_model
 class PictureTable:
     """[picture] of a scene."""
 
     tones: scene.Tones = scene.Tones()
     background: scene.Background = "plain"
     ground: float = 0.0
-    relief: NotNegative = 0.0
-    pad_mm: NotNegative = 0.0
-    pocket_mm: NotNegative = 0.0
-    corner_radius_mm: NotNegative = 0.0
+    relief: models.NotNegative = 0.0
+    pad_mm: models.NotNegative = 0.0
+    pocket_mm: models.NotNegative = 0.0
+    corner_radius_mm: models.NotNegative = 0.0
 
 
-@table_model
+@models.table_model
 class ImageFilmTable:
     """[image.film] of a scene; absent keys: random."""
 
-    scale_ppm: NumberOrPair | None = None
+    scale_ppm: models.NumberOrPair | None = None
     shear_urad: float | None = None
     rotation_deg: float = 0.0
     shift_mm: tuple[float, float] = (0.0, 0.0)
 
 
-@table_model
+@models.table_model
 class ImageTable:
     """[[image]] of a scene; the position on the scanner is random if absent."""
 
     name: str
     position: tuple[float, float, float]
     angles_deg: tuple[float, float, float]
-    pose: Annotated[str, choice(*scene.POSES)] = "0"
+    pose: Annotated[str, models.choice(*scene.POSES)] = "0"
     turn_deg: float | None = None
     offset_mm: tuple[float, float] | None = None
     film: ImageFilmTable = ImageFilmTable()
     covered: tuple[str, ...] = ()
     neighbour: scene.Side | None = None
-    neighbour_gap_mm: NotNegative = 3.0
+    neighbour_gap_mm: models.NotNegative = 3.0
     writing: tuple[scene.Writing, ...] = ()
     part_of: str = ""
     part: tuple[float, float] = (0.0, 1.0)
 
 
-@table_model
+@models.table_model
 class SceneTable:
     """SCENE.toml. camera: its table or the name of its file; writing: on all frames."""
 
     name: str | None = None
     seed: int = 1
-    camera: Annotated[str | Mapping[str, Any], Key("text or table", lambda value: value)]
-    field: Values
+    camera: Annotated[str | Mapping[str, Any], models.Key("text or table", lambda value: value)]
+    field: models.Values
     film: FilmTable = FilmTable()
     scan: ScanTable
     picture: PictureTable = PictureTable()
@@ -144,7 +135,7 @@ class SceneTable:
 
 def parse_scene(table: Table) -> SceneFile:
     """Build the scene from the root table of a file."""
-    given = read_model(table, SceneTable)
+    given = models.read_model(table, SceneTable)
     camera = _camera(table)
     try:
         field, unit = read_field(table.table("field"), given.seed)

@@ -20,17 +20,8 @@ from pipeline.text.csv_table import csv_line
 from pipeline.text.files import write_atomically
 from pipeline.text.table_models import NotNegative, NumberOrPair, WrongKey, table_model
 from pipeline.types import Array
+from synthetic_images import scene as scenes
 from synthetic_images.film import frame_geometry
-from synthetic_images.scene import (
-    BoardField,
-    CrossFigure,
-    DiskField,
-    FilmKind,
-    RingFigure,
-    Scene,
-    SceneImage,
-    TakingLens,
-)
 from synthetic_images.targets import Target, field_targets
 
 TAKING_CAMERA = "taking-camera.yaml"
@@ -82,7 +73,7 @@ class SceneFile:
     """
 
     path: Path
-    scene: Scene
+    scene: scenes.Scene
     camera: CameraFile
     unit: str
     given: Given
@@ -104,7 +95,7 @@ def write_project(scene_file: SceneFile, out_dir: Path) -> None:
         write_atomically(out_dir / TAKING_CAMERA, taking_camera_yaml(scene_file.scene, scene_file.scene.scanner.lens))
 
 
-def taking_camera_yaml(scene: Scene, lens: TakingLens) -> str:
+def taking_camera_yaml(scene: scenes.Scene, lens: scenes.TakingLens) -> str:
     """The true lens of the camera that photographed the film, for cv2.FileStorage."""
     geometry = frame_geometry(scene, 0)
     size = geometry.width_px, geometry.height_px
@@ -118,7 +109,7 @@ def taking_camera_yaml(scene: Scene, lens: TakingLens) -> str:
     return str(storage.releaseAndGetString())
 
 
-def _middle(scene: Scene, targets: tuple[Target, ...]) -> Array:
+def _middle(scene: scenes.Scene, targets: tuple[Target, ...]) -> Array:
     """Centre of the field; without targets, the ground below the photographs."""
     if targets:
         return np.asarray(np.mean([target.center for target in targets], axis=0))
@@ -195,7 +186,7 @@ def _images_csv(scene_file: SceneFile, middle: Array, generator: np.random.Gener
 
 
 def _given_exterior(
-    scene_file: SceneFile, image: SceneImage, middle: Array, generator: np.random.Generator
+    scene_file: SceneFile, image: scenes.SceneImage, middle: Array, generator: np.random.Generator
 ) -> list[str]:
     station = np.asarray(image.exterior[:3])
     spread = scene_file.given.position * float(np.linalg.norm(station - middle))
@@ -239,16 +230,16 @@ def _targets_text(scene_file: SceneFile) -> str:
         # The sigma of heights includes that of the given ground and its relief.
         scene, sigma = scene_file.scene, scene_file.given.point[1]
         return f"[ties]\nheight = {scene.ground:.6g}\nheight_sigma = {np.hypot(sigma, scene.relief):.6g}\n"
-    if isinstance(field, DiskField) and isinstance(field.figure, CrossFigure):
+    if isinstance(field, scenes.DiskField) and isinstance(field.figure, scenes.CrossFigure):
         arm = field.diameter / 2.0 * mm
         return f'[targets]\nkind = "cross"\narm_mm = {arm:.6g}\nline_mm = {field.figure.line * arm:.6g}\n'
-    if isinstance(field, DiskField) and isinstance(field.figure, RingFigure):
+    if isinstance(field, scenes.DiskField) and isinstance(field.figure, scenes.RingFigure):
         ring = f"[{field.figure.inner:g}, {field.figure.outer:g}]"
         return (
             f'[targets]\nkind = "coded-ring"\nbits = {field.figure.bits}\nring = {ring}\n'
             f"diameter_mm = {field.diameter * mm:.6g}\n"
         )
-    if not isinstance(field, BoardField):
+    if not isinstance(field, scenes.BoardField):
         return f'[targets]\nkind = "disk"\ndiameter_mm = {field.diameter * mm:.6g}\n'
     text = f'[targets]\nkind = "{field.kind}"\ncolumns = {field.columns}\nrows = {field.rows}\n'
     if field.kind == "chessboard":
@@ -257,6 +248,6 @@ def _targets_text(scene_file: SceneFile) -> str:
     return f"{text}{dots}asymmetric = {str(field.asymmetric).lower()}\n"
 
 
-def film_transformation(scene_file: SceneFile) -> FilmKind | Literal["none"]:
+def film_transformation(scene_file: SceneFile) -> scenes.FilmKind | Literal["none"]:
     """Transformation of the scene's film; none for a camera without fiducials."""
     return scene_file.scene.film.kind if scene_file.camera.fiducials else "none"

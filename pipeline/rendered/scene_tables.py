@@ -11,21 +11,8 @@ from pydantic import Field
 
 from measure.targets.ring_codes import RingCode
 from pipeline.files.project_tables import UNITS_MM, Datum, Film, ScannerSetting, ScannerSigma, scanner_setting
-from pipeline.text.table_models import (
-    Key,
-    NotNegative,
-    Positive,
-    Sigma,
-    WrongKey,
-    choice,
-    number,
-    numbers,
-    read_kind,
-    table_model,
-    text,
-    texts,
-    whole,
-)
+from pipeline.text import table_models as models
+from pipeline.text.table_models import number, numbers
 from pipeline.text.tables import Table
 from pipeline.types import Array
 from synthetic_images.scene import BoardField, CrossFigure, DiskField, DiskTarget, RingFigure
@@ -36,14 +23,14 @@ UNOBSERVED: Triple = (math.inf,) * 3
 
 
 def _quantity(value: Any) -> str:
-    if not text(value) or not all(value.split(".")):
+    if not models.text(value) or not all(value.split(".")):
         raise ValueError(f'is {value!r}; write a dotted name, such as "design.sigma_height".')
     return str(value)
 
 
 def _values(value: Any) -> Values:
     is_text = isinstance(value, list) and bool(value) and all(isinstance(each, str) for each in value)
-    values = texts(value) if is_text else numbers(value)
+    values = models.texts(value) if is_text else numbers(value)
     if len(set(values)) < 2:
         raise ValueError("needs two different values at least.")
     return values
@@ -66,18 +53,18 @@ def _radii(value: Any) -> tuple[float, ...]:
     return tuple(sorted(radii))
 
 
-_ThreeSigmas = Annotated[Triple, Key("[sx, sy, sz]", _three_sigmas)]
+_ThreeSigmas = Annotated[Triple, models.Key("[sx, sy, sz]", _three_sigmas)]
 
 
-@table_model
+@models.table_model
 class Sweep:
     """A quantity of the scene, by its dotted name, and its values."""
 
-    quantity: Annotated[str, Key("dotted name", _quantity)]
-    values: Annotated[Values, Key("list of values", _values)]
+    quantity: Annotated[str, models.Key("dotted name", _quantity)]
+    values: Annotated[Values, models.Key("list of values", _values)]
 
 
-@table_model
+@models.table_model
 class Photo:
     """A photograph that could be added: X0, Y0, Z0 in object units, omega, phi, kappa in degrees."""
 
@@ -86,22 +73,22 @@ class Photo:
     angles_deg: Triple
 
 
-@table_model
+@models.table_model
 class PlannedDistance:
     """A planned distance between two targets, two stations (by the images' names) or one of each; its standard
     deviation in object units."""
 
     start: Annotated[str, Field(alias="from")]
     end: Annotated[str, Field(alias="to")]
-    sigma: Positive
+    sigma: models.Positive
 
     def __post_init__(self) -> None:
         """Raises WrongKey for two equal ends."""
         if self.start == self.end:
-            raise WrongKey("to", "is the same as from: a distance has two ends.")
+            raise models.WrongKey("to", "is the same as from: a distance has two ends.")
 
 
-@table_model
+@models.table_model
 class PlannedOrientation:
     """Planned observations of exterior orientations.
 
@@ -119,10 +106,10 @@ class PlannedOrientation:
     def __post_init__(self) -> None:
         """Raises WrongKey where nothing is observed."""
         if all(math.isinf(sigma) for sigma in (*self.position_sigma, *self.angles_sigma_deg)):
-            raise WrongKey("position_sigma", "or angles_sigma_deg must be given: else nothing is observed.")
+            raise models.WrongKey("position_sigma", "or angles_sigma_deg must be given: else nothing is observed.")
 
 
-@table_model
+@models.table_model
 class DesignSettings:
     """Settings of a design in addition to the scene, with the names of project.toml."""
 
@@ -130,22 +117,24 @@ class DesignSettings:
         Film | None, "Film deformation model; absent: the scene's, none for a camera without fiducials."
     ] = None
     datum: Datum = "control"
-    sigma_target_um: Positive = 5.0
-    sigma_fiducial_um: Positive = 5.0
-    film_sigma_um: NotNegative = 0.0
+    sigma_target_um: models.Positive = 5.0
+    sigma_fiducial_um: models.Positive = 5.0
+    film_sigma_um: models.NotNegative = 0.0
     scanner: Annotated[ScannerSetting, scanner_setting("none", "bend")] = "none"
     scanner_sigma_um: ScannerSigma = math.inf
-    sigma0: Annotated[Positive, "What the a-priori standard deviations are to be multiplied by."] = 1.0
-    sigma_planimetry: Annotated[Sigma, "Of the test field's X and Y, object units; absent: as in [given]."] = math.inf
-    sigma_height: Annotated[Sigma, "Of its Z; absent: as in [given]."] = math.inf
+    sigma0: Annotated[models.Positive, "What the a-priori standard deviations are to be multiplied by."] = 1.0
+    sigma_planimetry: Annotated[models.Sigma, "Of the test field's X and Y, object units; absent: as in [given]."] = (
+        math.inf
+    )
+    sigma_height: Annotated[models.Sigma, "Of its Z; absent: as in [given]."] = math.inf
     control_points: Annotated[tuple[str, ...], "The only points of which these are known; absent: all."] = ()
     radii_mm: Annotated[
         tuple[float, ...],
-        Key("list of numbers", _radii),
+        models.Key("list of numbers", _radii),
         "Where the distortion's precision is given; absent: quarters of the half diagonal.",
     ] = ()
     layouts: Annotated[
-        int, whole(least=1), "Random layouts of the test field that the standard deviations are averaged over."
+        int, models.whole(least=1), "Random layouts of the test field that the standard deviations are averaged over."
     ] = 1
     alternatives: bool = True
     photo: tuple[Photo, ...] = ()
@@ -158,7 +147,7 @@ class DesignSettings:
         for at, each in enumerate(self.orientation):
             if any(other.image == each.image for other in self.orientation[:at]):
                 whose = f"image {each.image!r}" if each.image else "all images"
-                raise WrongKey("orientation", f"an orientation of {whose} is given already. Remove one of both.")
+                raise models.WrongKey("orientation", f"an orientation of {whose} is given already. Remove one of both.")
 
     def planned_orientation(self, image: str) -> PlannedOrientation | None:
         """Planned observation of an image's exterior orientation; None where it is not observed."""
@@ -167,11 +156,11 @@ class DesignSettings:
 
 
 _Triple = tuple[float, float, float]
-_Count = Annotated[int, whole(least=1)]
-_BoardCount = Annotated[int, whole(least=2)]
+_Count = Annotated[int, models.whole(least=1)]
+_BoardCount = Annotated[int, models.whole(least=2)]
 
 
-@table_model
+@models.table_model
 class _Plane(ABC):
     """Targets from a number on: a centre, steps right and up, and a relief: the largest distance from the plane."""
 
@@ -179,11 +168,11 @@ class _Plane(ABC):
     center: _Triple = (0.0, 0.0, 0.0)
     right: _Triple
     up: _Triple
-    relief: NotNegative = 0.0
+    relief: models.NotNegative = 0.0
 
     def __post_init__(self) -> None:
         if not np.linalg.norm(np.cross(self.right, self.up)) > 0.0:
-            raise WrongKey("up", "must not be parallel to right: the two steps span the plane of the targets.")
+            raise models.WrongKey("up", "must not be parallel to right: the two steps span the plane of the targets.")
 
     @abstractmethod
     def draw_targets(self, generator: np.random.Generator) -> list[DiskTarget]:
@@ -202,13 +191,13 @@ class _Plane(ABC):
         ]
 
 
-@table_model
+@models.table_model
 class _Grid(_Plane):
     """Targets on a grid around a centre, row by row from the bottom, with random shifts in the plane and out of it."""
 
     columns: _Count
     rows: _Count
-    jitter: NotNegative = 0.0
+    jitter: models.NotNegative = 0.0
 
     def draw_targets(self, generator: np.random.Generator) -> list[DiskTarget]:
         row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
@@ -217,7 +206,7 @@ class _Grid(_Plane):
         return self.targets(across, along, generator.uniform(-1.0, 1.0, len(row)))
 
 
-@table_model
+@models.table_model
 class _Scatter(_Plane):
     """Random targets over a parallelogram, and out of its plane. A smaller number gives the first of a larger one."""
 
@@ -228,47 +217,47 @@ class _Scatter(_Plane):
         return self.targets(across, along, 2.0 * height)
 
 
-@table_model
+@models.table_model
 class _Target:
     id: str
     xyz: _Triple
     normal: _Triple = (0.0, 0.0, 1.0)
 
 
-@table_model
+@models.table_model
 class FieldTable(ABC):
     """Keys of every table [field]."""
 
     kind: str = "disks"
-    unit: Annotated[str, choice(*UNITS_MM)] = "m"
+    unit: Annotated[str, models.choice(*UNITS_MM)] = "m"
 
     @abstractmethod
     def field(self, mm: float, seed: int) -> DiskField | BoardField:
         """Test field. mm: millimetre in object units. Raises ValueError where it is impossible."""
 
 
-@table_model
+@models.table_model
 class _Natural(FieldTable):
     def field(self, mm: float, seed: int) -> DiskField:
         return DiskField((), 1.0)
 
 
-@table_model
+@models.table_model
 class _Chessboard(FieldTable):
     columns: _BoardCount
     rows: _BoardCount
-    square_mm: Positive
+    square_mm: models.Positive
 
     def field(self, mm: float, seed: int) -> BoardField:
         return BoardField("chessboard", self.columns, self.rows, self.square_mm * mm)
 
 
-@table_model
+@models.table_model
 class _CircleGrid(FieldTable):
     columns: _BoardCount
     rows: _BoardCount
-    spacing_mm: Positive
-    diameter_mm: Positive
+    spacing_mm: models.Positive
+    diameter_mm: models.Positive
     asymmetric: bool = False
 
     def field(self, mm: float, seed: int) -> BoardField:
@@ -276,12 +265,12 @@ class _CircleGrid(FieldTable):
         return BoardField("circle-grid", self.columns, self.rows, *sizes, self.asymmetric)
 
 
-@table_model
+@models.table_model
 class _Figures(FieldTable):
     grid: tuple[_Grid, ...] = ()
     scatter: tuple[_Scatter, ...] = ()
     target: tuple[_Target, ...] = ()
-    surround: NotNegative = 2.0
+    surround: models.NotNegative = 2.0
 
     def figures(self, seed: int, diameter: float, figure: CrossFigure | None = None) -> DiskField:
         generator = np.random.default_rng([seed, 10])
@@ -291,29 +280,29 @@ class _Figures(FieldTable):
 
     def __post_init__(self) -> None:
         if not (self.grid or self.scatter or self.target):
-            raise WrongKey(
+            raise models.WrongKey(
                 "grid", "the field has no target. Add [[field.grid]], [[field.scatter]] or [[field.target]]."
             )
 
 
-@table_model
+@models.table_model
 class _Disks(_Figures):
-    diameter_mm: Positive
+    diameter_mm: models.Positive
 
     def field(self, mm: float, seed: int) -> DiskField:
         return self.figures(seed, self.diameter_mm * mm)
 
 
-@table_model
+@models.table_model
 class _Crosses(_Figures):
-    arm_mm: Positive
-    line_mm: Positive
+    arm_mm: models.Positive
+    line_mm: models.Positive
 
     def field(self, mm: float, seed: int) -> DiskField:
         return self.figures(seed, 2.0 * self.arm_mm * mm, CrossFigure(self.line_mm / self.arm_mm))
 
 
-@table_model
+@models.table_model
 class _CodedRings(_Disks):
     """Every n-th disk has a ring code, and its number as its name."""
 
@@ -326,7 +315,9 @@ class _CodedRings(_Disks):
         field, numbers = super().field(mm, seed), code.published_numbers()
         coded = range(0, len(field.targets), self.every)
         if len(coded) > len(numbers):
-            raise WrongKey("bits", f"{code.bits} bits have {len(numbers)} codes, and {len(coded)} targets need one.")
+            raise models.WrongKey(
+                "bits", f"{code.bits} bits have {len(numbers)} codes, and {len(coded)} targets need one."
+            )
         name = {index: str(number) for index, number in zip(coded, numbers, strict=False)}
         targets = tuple(replace(target, id=name.get(index, target.id)) for index, target in enumerate(field.targets))
         figure = RingFigure(code.bits, *code.ring, {id: int(id) for id in name.values()})
@@ -346,8 +337,8 @@ _FIELDS: Mapping[str, type[FieldTable]] = {
 def read_field(table: Table, seed: int) -> tuple[DiskField | BoardField, str]:
     """Read the test field and the unit of its coordinates; a field of kind natural has no targets. Raises InputError,
     or ValueError for a field that is impossible."""
-    given = read_kind(table, _FIELDS, usual="disks")
+    given = models.read_kind(table, _FIELDS, usual="disks")
     try:
         return given.field(1.0 / UNITS_MM[given.unit], seed), given.unit
-    except WrongKey as error:
+    except models.WrongKey as error:
         raise table.error(error.key, str(error)) from None

@@ -15,12 +15,7 @@ from pipeline.report import fiducials, lens, vectors
 from pipeline.report.data import ReportData
 from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.numbers import fixed, significant
-from pipeline.report.parameters import (
-    camera_values,
-    high_correlations,
-    parameter_rows,
-    term_rows,
-)
+from pipeline.report.parameters import camera_values, high_correlations, parameter_rows, term_rows
 from pipeline.report.vectors import contour_plot, coverage_plot, grid_mm, longest_vector, padded_plane, strokes_and_dots
 from pipeline.results.adjustment_file import Covariance
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, ScannerRecord

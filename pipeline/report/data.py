@@ -243,9 +243,7 @@ def natural(name: str) -> list[tuple[int, str]]:
 
 def _marks(data: ReportData, scans: Mapping[str, MeasuredScan]) -> Iterator[Mark]:
     """Join the sources of each mark. The comparator file takes precedence, since the user may have edited it."""
-    measured = {
-        (image, mark.kind == "fiducial", mark.point): mark for image, scan in scans.items() for mark in scan.frame.marks
-    }
+    measured = {(image, m.kind == "fiducial", m.point): m for image, scan in scans.items() for m in scan.frame.marks}
     residuals = {
         (row.image, row.kind == "fiducial", row.point): row
         for row in (data.adjustment.residuals if data.adjustment else ())

@@ -61,11 +61,7 @@ def _worst(frame: Frame, most: int) -> list[Mark]:
 
 def _badness(mark: Mark) -> tuple[bool, bool, float]:
     """Sort key, larger is worse: rejected, then weak or predicted, then the standardised residual."""
-    return (
-        mark.status == "rejected",
-        mark.status in ("weak", "predicted"),
-        abs(mark.w) if mark.w is not None else 0.0,
-    )
+    return (mark.status == "rejected", mark.status in ("weak", "predicted"), abs(mark.w) if mark.w is not None else 0.0)
 
 
 def arrow_scale(shots: list[Frame]) -> float:
@@ -281,9 +277,7 @@ def _observed_share(marks: list[Mark]) -> str:
         return "–"
     counts = {status: sum(mark.status is status for mark in marks) for status in Status}
     observed = counts[Status.MEASURED] + counts[Status.WEAK]
-    others = ", ".join(
-        f"{number} {status}" for status, number in counts.items() if number and status is not Status.MEASURED
-    )
+    others = ", ".join(f"{n} {status}" for status, n in counts.items() if n and status is not Status.MEASURED)
     return f"{observed} of {len(marks)}" + (f" ({others})" if others else "")
 
 

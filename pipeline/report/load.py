@@ -12,17 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from measure.flags import Status
+from pipeline.archive import made_from as provenance
 from pipeline.archive.checked_results import Judging, measured_scans, stored_judging, written_judging
-from pipeline.archive.made_from import (
-    CAMERA,
-    DECISIONS,
-    PLACES,
-    SCAN,
-    SETTINGS,
-    adjusted_from,
-    differing,
-    measured_from,
-)
 from pipeline.archive.review_decisions import inapplicable
 from pipeline.archive.verdicts import Verdict, scan_counts
 from pipeline.errors import InputError
@@ -30,14 +21,9 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.provenance import hash_file
 from pipeline.publishing import outside_note
+from pipeline.report import frame_problems
 from pipeline.report.data import Frame, FrameTotals, Problem, ReportData, frames
-from pipeline.report.frame_problems import (
-    Gathered,
-    centers_px,
-    gather,
-    places_apart,
-    single_frame_problems,
-)
+from pipeline.report.frame_problems import centers_px
 from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.verdict import suspect_rows
 from pipeline.results.adjustment_file import read_adjustment, read_covariance
@@ -68,19 +54,19 @@ class _FrameCounts:
     marks: dict[str, Counter[str]] = field(default_factory=dict)
     of_targets: Counter[tuple[str, str]] = field(default_factory=Counter)
     verdicts: dict[tuple[str, str], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
-    gathered: Gathered = field(default_factory=dict)
+    gathered: frame_problems.Gathered = field(default_factory=dict)
     centers_px: "array[float]" = field(default_factory=lambda: array("d"))
 
     @property
     def totals(self) -> FrameTotals:
-        places = places_apart(np.array(self.centers_px))
+        places = frame_problems.places_apart(np.array(self.centers_px))
         return FrameTotals(self.marks, self.of_targets, self.verdicts, tuple(_listed(self.gathered)), places)
 
     def add(self, frame: Frame, kind: tuple[str, str], verdict: Verdict, problems: Iterable[Problem]) -> None:
         self.verdicts[kind][verdict] += 1
         self.marks[frame.image] = Counter(str(mark.status) for mark in frame.marks)
         self.of_targets.update((mark.kind, mark.status) for mark in frame.marks if not mark.is_fiducial)
-        gather(self.gathered, frame.image, problems)
+        frame_problems.gather(self.gathered, frame.image, problems)
         for center in centers_px(frame):
             self.centers_px.extend(center.tolist())
 
@@ -120,7 +106,7 @@ def reduced(
         """Count all frames; yield those that need a look with a sort key, the worst first."""
         for one in _one_by_one(data, scans):
             (frame,) = frames(one)
-            verdict, problems = frame.verdict, list(single_frame_problems(frame))
+            verdict, problems = frame.verdict, list(frame_problems.single_frame_problems(frame))
             kind = image_camera(frame.image), _ending(frame.scan.scan) if frame.scan else "given"
             counts.add(frame, kind, verdict, problems)
             if problems or verdict.needs_review or frame.image in suspect:
@@ -164,7 +150,7 @@ def _one_by_one(data: ReportData, scans: Iterable[MeasuredScan]) -> Iterator[Rep
         yield frame_data(image, None)
 
 
-def _listed(problems: Gathered) -> Iterator[Problem]:
+def _listed(problems: frame_problems.Gathered) -> Iterator[Problem]:
     """Yield problems, those of most frames first."""
     ordered = sorted(problems.values(), key=lambda each: -len(each.images))
     yield from (each.together() for each in ordered[:_MOST_PROBLEMS])
@@ -252,10 +238,11 @@ def measured_data(
     data = replace(data, measurement=scans, made_from={**data.made_from, path.name: digest})
     unlike: list[Problem] = []
     if project.scans:
-        now = measured_from(project)
+        now = provenance.measured_from(project)
         unlike = list(_unlike(made, now))
-        if made.get(PLACES) != now[PLACES]:
-            note = f"The marks were looked for with other {PLACES} than there are now; `reseau measure` looks again."
+        if made.get(provenance.PLACES) != now[provenance.PLACES]:
+            places = provenance.PLACES
+            note = f"The marks were looked for with other {places} than there are now; `reseau measure` looks again."
             data = replace(data, notes=(*data.notes, note))
     damaged = [
         Problem(scan.failure.sentence, "Nothing else of this image is shown as measured until then.")
@@ -331,7 +318,7 @@ def adjusted_data(project: Project, at: At, most_frames: int | None = None) -> R
         return data
     adjustment, covariance, fingerprint = read_adjustment(path), read_covariance(path), hash_file(path)
     made, not_shown = adjustment.made_from, ""
-    if others := differing(made, adjusted_from(project, data.comparator)):
+    if others := provenance.differing(made, provenance.adjusted_from(project, data.comparator)):
         what = f"of other {' and '.join(others)} than there are now" if made else "of what it does not say"
         not_shown = f"{path.name} is {what}: it is not shown."
     elif covariance.adjustment != fingerprint:
@@ -353,23 +340,25 @@ def adjusted_data(project: Project, at: At, most_frames: int | None = None) -> R
 
 def _unlike(made: Mapping[str, str], now: Mapping[str, str]) -> Iterator[Problem]:
     """Yield problems of measurements that do not match the current scans, decisions or settings."""
-    others = differing(made, now)
-    scans = [name.removeprefix(SCAN) for name in others if name.startswith(SCAN)]
+    others = provenance.differing(made, now)
+    scans = [name.removeprefix(provenance.SCAN) for name in others if name.startswith(provenance.SCAN)]
     kinds = {
-        "Not measured yet": [name for name in scans if SCAN + name not in made],
-        "Changed since it was measured": [name for name in scans if SCAN + name in made and SCAN + name in now],
-        "Measured, but no scan of the project any more": [name for name in scans if SCAN + name not in now],
+        "Not measured yet": [name for name in scans if provenance.SCAN + name not in made],
+        "Changed since it was measured": [
+            name for name in scans if provenance.SCAN + name in made and provenance.SCAN + name in now
+        ],
+        "Measured, but no scan of the project any more": [name for name in scans if provenance.SCAN + name not in now],
     }
     for what, names in kinds.items():
         if names:
             yield Problem(f"{what}: {listed(names)}.", "Run `reseau measure`; what is shown is of the earlier scans.")
-    if DECISIONS in others:
+    if provenance.DECISIONS in others:
         yield Problem(
             "Decisions were made, or taken back, since the cross-scan checks.",
             "Run `reseau measure`, which takes them in; what is shown is without them.",
         )
-    changed = ["project" if name == SETTINGS else name for name in others if name in made and name in now]
-    changed = [name for name in changed if name == "project" or name.startswith(CAMERA)]
+    changed = ["project" if name == provenance.SETTINGS else name for name in others if name in made and name in now]
+    changed = [name for name in changed if name == "project" or name.startswith(provenance.CAMERA)]
     if changed:
         yield Problem(
             f"The marks were measured with other settings than there are now of {listed(changed)}.",

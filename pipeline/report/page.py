@@ -14,15 +14,9 @@ from markupsafe import Markup, escape
 
 from measure import flags
 from pipeline.drawing import svg
+from pipeline.report import frame_problems
 from pipeline.report.camera_views import camera_views, scanner_views
 from pipeline.report.data import Frame, Problem, ReportData, frames
-from pipeline.report.frame_problems import (
-    LEAST_MARKS,
-    FractionTest,
-    fraction_plot,
-    fraction_test,
-    places_px,
-)
 from pipeline.report.frame_views import FrameView, arrow_scale, cards_to_show, frame_views
 from pipeline.report.load import totals_view
 from pipeline.report.numbers import fixed, fixed_list, significant, value_and_sigma
@@ -96,7 +90,7 @@ def _context(data: ReportData) -> dict[str, object]:
     adjustment = data.adjustment
     cameras = camera_views(data)
     calibrated = any(camera.is_calibrated for camera in cameras)
-    places = data.totals.places_px if data.totals else places_px(shots)
+    places = data.totals.places_px if data.totals else frame_problems.places_px(shots)
     verdict, frame_context = judge(data), _frame_context(data, shots)
     return {
         **_common(data),
@@ -114,7 +108,7 @@ def _context(data: ReportData) -> dict[str, object]:
         "scanners": scanner_views(data),
         "joined": [(name, joined_view(each)) for name, each in sorted(adjustment.frames.items())] if adjustment else [],
         "fractions": list(_fractions(places)),
-        "least_marks": LEAST_MARKS,
+        "least_marks": frame_problems.LEAST_MARKS,
         "sigma0_bounds": sigma0_bounds(adjustment.variance_factor.redundancy)
         if adjustment and adjustment.has_sigma0
         else None,
@@ -186,12 +180,12 @@ def _points_word(shots: list[Frame]) -> str:
     return "targets and tie points" if "target" in kinds else "tie points"
 
 
-def _fractions(places: Mapping[str, Array]) -> Iterator[tuple[str, FractionTest, Markup]]:
+def _fractions(places: Mapping[str, Array]) -> Iterator[tuple[str, frame_problems.FractionTest, Markup]]:
     """Yield axis, test of the fractional parts and its plot; nothing without pixel positions."""
     for axis, positions in places.items():
         if len(positions):
-            test = fraction_test(positions)
-            yield axis, test, fraction_plot(axis, test)
+            test = frame_problems.fraction_test(positions)
+            yield axis, test, frame_problems.fraction_plot(axis, test)
 
 
 def _arrow_bar(data: ReportData, shots: list[Frame]) -> tuple[float, float]:

@@ -15,19 +15,14 @@ from pipeline.report.data import Frame, MarkKey, Problem, ReportData, frames
 from pipeline.report.frame_problems import frame_problems, images_by_sentence, pixel_locking, places_px
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.report.parameters import LARGER, camera_values, cluster_ratio, spoken_name
+from pipeline.results import assessment_record
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord
-from pipeline.results.assessment_record import (
-    ContradictionRecord,
-    DistanceRecord,
-    FiducialDistanceRecord,
-    ObservedQuantity,
-    ResidualRecord,
-    SuspectRecord,
-)
 from pipeline.results.stage_files import Check
 from pipeline.text.wording import counted, listed
 
-Observed = DistanceRecord | FiducialDistanceRecord | ObservedQuantity
+Observed = (
+    assessment_record.DistanceRecord | assessment_record.FiducialDistanceRecord | assessment_record.ObservedQuantity
+)
 Level = Literal["good", "look", "failed"]
 Evidence = Callable[[ReportData, list[Frame]], Iterable[Problem]]
 
@@ -102,7 +97,7 @@ def critical_w(tests: int) -> float:
     return -float(ndtri(0.5 * (1.0 - CONFIDENCE) / max(tests, 1)))
 
 
-def suspect_rows(adjustment: AdjustmentRecord) -> frozenset[ResidualRecord]:
+def suspect_rows(adjustment: AdjustmentRecord) -> frozenset[assessment_record.ResidualRecord]:
     """Residuals of image points suspected of gross errors."""
     names = {(row.group, row.owner, row.point) for row in adjustment.suspects}
     return frozenset(row for row in adjustment.residuals if (row.kind, row.image, row.point) in names)
@@ -163,12 +158,12 @@ def _suspects(adjustment: AdjustmentRecord) -> Iterator[Problem]:
         )
 
 
-def _suspect_marks(rows: Sequence[SuspectRecord]) -> tuple[MarkKey, ...]:
+def _suspect_marks(rows: Sequence[assessment_record.SuspectRecord]) -> tuple[MarkKey, ...]:
     """Keys of the suspects that are marks of a frame."""
     return tuple((row.owner, row.group, row.point) for row in rows if row.group in ON_FRAMES)
 
 
-def _suspect(row: SuspectRecord) -> str:
+def _suspect(row: assessment_record.SuspectRecord) -> str:
     alike = f"; not distinguishable from {', '.join(row.alike)}" if row.alike else ""
     return f"{row.name} (w = {fixed(row.w, 1)}{alike})"
 
@@ -191,12 +186,10 @@ def _named(rows: Sequence[Observed], names: Sequence[str]) -> str:
     return listed([f"{n} (v = {row.v:.4g}, w = {fixed(row.w, 1)})" for n, row in zip(names, rows, strict=True)])
 
 
-def contradiction(test: ContradictionRecord, cameras: Mapping[str, CameraRecord]) -> str:
+def contradiction(test: assessment_record.ContradictionRecord, cameras: Mapping[str, CameraRecord]) -> str:
     """State the compatibility test of the images with an earlier calibration, and the quantities in contradiction."""
     known = [row for row in test.direction if math.isfinite(row.difference) and row.sigma > 0.0][:MOST_QUANTITIES]
-    by = ", ".join(
-        f"{spoken_name(row.name, cameras)} {row.difference:+.3g} (its sigma {row.sigma:.2g})" for row in known
-    )
+    by = ", ".join(f"{spoken_name(r.name, cameras)} {r.difference:+.3g} (its sigma {r.sigma:.2g})" for r in known)
     return (
         f"p = {test.p:.2g} (F = {fixed(test.F, 1)}, {test.freedom} degrees of freedom). They differ from it most in "
         f"{by}, in mm and powers of it"

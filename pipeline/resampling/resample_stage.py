@@ -36,15 +36,7 @@ from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
 from pipeline.provenance import file_state, fingerprint
-from pipeline.resampling.canvas import (
-    Canvas,
-    FrameChain,
-    image_chain,
-    measured_chain,
-    middle_mm,
-    outline_canvas,
-    scan_places,
-)
+from pipeline.resampling import canvas as frame_canvas
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparator_file import read_comparator
 from pipeline.results.measured_record import MeasuredScan
@@ -139,7 +131,7 @@ class Part:
     another scan; smoothing_px: see `interpolated`."""
 
     source: SampleSource
-    chain: FrameChain
+    chain: frame_canvas.FrameChain
     smoothing_px: float = 0.0
     inner: tuple[bool, ...] = (False,) * 4
 
@@ -156,7 +148,7 @@ def read_description(path: Path) -> dict[str, Any] | None:
 
 def write_frame(
     path: Path,
-    canvas: Canvas,
+    canvas: frame_canvas.Canvas,
     description: Mapping[str, object],
     channels: int,
     dtype: type,
@@ -230,7 +222,7 @@ def write_frame(
 class _Reduced:
     """Reduced pages by area averaging: the first one from the tiles, each other one from the page before it."""
 
-    def __init__(self, canvas: Canvas, channels: int, dtype: type) -> None:
+    def __init__(self, canvas: frame_canvas.Canvas, channels: int, dtype: type) -> None:
         self.factor = _REDUCTION
         pixel_bytes = channels * np.dtype(dtype).itemsize
         while canvas.width_px * canvas.height_px * pixel_bytes / self.factor**2 > _LARGEST_REDUCED_BYTES:
@@ -267,7 +259,7 @@ class FrameScan:
 
     image: str
     scan: Path
-    chain: FrameChain
+    chain: frame_canvas.FrameChain
 
 
 @dataclass(frozen=True)
@@ -401,11 +393,13 @@ def _chain(
     with_lens: bool,
     is_part: bool,
     taking_lens: Lens | None = None,
-) -> FrameChain | str:
+) -> frame_canvas.FrameChain | str:
     """Adjusted chain of an image, or the chain from its fiducials, or the reason why there is none."""
     image = measured.frame.image
     if adjustment is not None and image in adjustment.images:
-        return image_chain(image, adjustment, measured.pitch_um, middle_mm(measured), with_lens)
+        return frame_canvas.image_chain(
+            image, adjustment, measured.pitch_um, frame_canvas.middle_mm(measured), with_lens
+        )
     if with_lens:
         return "it has no part in the adjustment, so its lens is not known: resample it without --lens"
     if is_part:
@@ -414,7 +408,7 @@ def _chain(
             "see what it says of this one"
         )
     why_not = "too few of its fiducial marks were found to say where its frame lies"
-    return measured_chain(measured, taking_lens) or why_not
+    return frame_canvas.measured_chain(measured, taking_lens) or why_not
 
 
 def resampled(task: ResampleTask) -> Resampled:
@@ -429,7 +423,7 @@ def _resampled(task: ResampleTask) -> Resampled:
     before = read_description(task.target)
     with ExitStack() as opened:
         scans = [(opened.enter_context(open_scan(each.scan, task.max_pixels)), each.chain) for each in task.scans]
-        canvas = outline_canvas([(chain, scan.part_px) for scan, chain in scans], task.pitch_mm)
+        canvas = frame_canvas.outline_canvas([(chain, scan.part_px) for scan, chain in scans], task.pitch_mm)
         done = Resampled(task.image, task.target, canvas.width_px, canvas.height_px, doubt=task.doubt)
         scanned = sum(scan.width_px * scan.height_px for scan, _ in scans)
         if canvas.width_px * canvas.height_px > _MOST_LARGER * scanned:
@@ -459,7 +453,7 @@ def _resampled(task: ResampleTask) -> Resampled:
     return replace(done, clamped=clamped)
 
 
-def _smoothing_px(chain: FrameChain, canvas: Canvas) -> float:
+def _smoothing_px(chain: frame_canvas.FrameChain, canvas: frame_canvas.Canvas) -> float:
     """Smoothing for a canvas: half of what a step in its middle exceeds a pixel of the scan by, as of scikit-image's
     `resize`; 0 for steps of about a pixel."""
     middle = np.array([canvas.width_px, canvas.height_px]) / 2.0
@@ -468,7 +462,7 @@ def _smoothing_px(chain: FrameChain, canvas: Canvas) -> float:
     return (step_px - 1.0) / 2.0 if step_px > _COARSER else 0.0
 
 
-def _rows_at_a_time(chain: FrameChain, pitch_mm: float, width_px: int) -> int:
+def _rows_at_a_time(chain: frame_canvas.FrameChain, pitch_mm: float, width_px: int) -> int:
     """Number of rows of a scan that a row of tiles covers."""
     ends = np.array([(0.0, 0.0), (width_px, 0.0), (0.0, -TILE_PX), (width_px, -TILE_PX)]) * pitch_mm
     pixels, _ = chain.scan_from_frame(ends)
@@ -551,9 +545,7 @@ def find_inner_edges(parts: Sequence[Part]) -> list[Part]:
     """Determine the inner edges of the scans. Raises MeasurementError for scans with different pixel types."""
     kinds = {(part.source.channels, np.dtype(part.source.dtype).name) for part in parts}
     if len(kinds) > 1:
-        kinds_text = " and ".join(
-            f"{channels} channel{'s' * (channels > 1)} of {dtype}" for channels, dtype in sorted(kinds)
-        )
+        kinds_text = " and ".join(f"{n} channel{'s' * (n > 1)} of {dtype}" for n, dtype in sorted(kinds))
         raise MeasurementError(f"its scans have different pixel types: {kinds_text}. Scan both alike.")
     return [replace(part, inner=_inner_edges(part, [each for each in parts if each is not part])) for part in parts]
 
@@ -571,9 +563,11 @@ def _inner_edges(part: Part, others: Sequence[Part]) -> tuple[bool, ...]:
     return tuple(inside.tolist())
 
 
-def joined_tile(parts: Sequence[Part], canvas: Canvas, col0: int, row0: int, side: int, degree: Degree) -> Tile:
+def joined_tile(
+    parts: Sequence[Part], canvas: frame_canvas.Canvas, col0: int, row0: int, side: int, degree: Degree
+) -> Tile:
     """Tile of the frame. A pixel that is lost in the preferred scan comes from another one that has it."""
-    places = [scan_places(part.chain, canvas, col0, row0, side) for part in parts]
+    places = [frame_canvas.scan_places(part.chain, canvas, col0, row0, side) for part in parts]
     if len(parts) == 1:
         return interpolated(parts[0].source, *places[0], degree, parts[0].smoothing_px)
     depths = np.stack([_depth(part, *place) for part, place in zip(parts, places, strict=True)])
@@ -603,7 +597,7 @@ def _depth(part: Part, columns: Array, rows: Array) -> Array:
         return np.where((from_edges >= 0.0).all(axis=0), depth, -np.inf)
 
 
-def seams_mm(parts: Sequence[Part], canvas: Canvas) -> list[list[tuple[float, float]]]:
+def seams_mm(parts: Sequence[Part], canvas: frame_canvas.Canvas) -> list[list[tuple[float, float]]]:
     """Seams between the scans: polylines in mm of the camera frame."""
     step = max(canvas.width_px, canvas.height_px) / (_NODES - 1)
     col, row = (np.arange(0.0, size, step) for size in (canvas.width_px, canvas.height_px))

@@ -213,9 +213,7 @@ def _camera(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, float
         return replace(known, sigma=math.nan) if is_idle else _tested(known, tests.get(name))
 
     given = camera.distortion.parameters
-    parameters = {
-        name: quantity(name, given.get(name, Prior(0.0))) for name in parameter_names(camera.distortion.family)
-    }
+    parameters = {key: quantity(key, given.get(key, Prior(0.0))) for key in parameter_names(camera.distortion.family)}
     reach = adjustment.lens_reach(camera, frame_mm)
     return CameraRecord(
         principal_distance_mm=quantity("c", camera.principal_distance_mm),

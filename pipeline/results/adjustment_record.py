@@ -21,17 +21,7 @@ from adjust.least_squares.iteration import Iteration
 from adjust.problem.estimates import GivenGroup
 from adjust.quality.run import Group
 from adjust.solution.explanations import Explanation
-from pipeline.results.assessment_record import (
-    ContradictionRecord,
-    CorrelationRecord,
-    DistanceRecord,
-    FiducialDistanceRecord,
-    NullDirectionRecord,
-    ObservedQuantity,
-    ReliabilityRecord,
-    ResidualRecord,
-    SuspectRecord,
-)
+from pipeline.results import assessment_record
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.results.record_json import FOREIGN, Finite, Flag, Number, NumberOrNone, Sigma, Whole, WithRest
 from pipeline.types import Array
@@ -90,10 +80,7 @@ class DistortionRecord(WithRest):
     def settings(self) -> Distortion:
         """Distortion family with its settings, without parameters."""
         return Distortion(
-            self.family,
-            decentering=self.decentering or "reduced",
-            r0_mm=self.r0_mm,
-            half_mm=self.half_mm or (0.0, 0.0),
+            self.family, decentering=self.decentering or "reduced", r0_mm=self.r0_mm, half_mm=self.half_mm or (0.0, 0.0)
         )
 
     @classmethod
@@ -433,8 +420,8 @@ class AdjustmentRecord:
     sigma0: Number
     sigma0_from: Sigma0Record | None = None
     covariance: str = ""
-    singular: tuple[NullDirectionRecord, ...]
-    correlations: tuple[CorrelationRecord, ...]
+    singular: tuple[assessment_record.NullDirectionRecord, ...]
+    correlations: tuple[assessment_record.CorrelationRecord, ...]
     warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)
@@ -442,22 +429,22 @@ class AdjustmentRecord:
     variance_factors: Mapping[str, Number]
     variance_sigmas: Mapping[str, Number]
     explanations: tuple[Annotated[Explanation, FOREIGN], ...] = ()
-    suspects: tuple[SuspectRecord, ...]
-    reliability: ReliabilityRecord | None
+    suspects: tuple[assessment_record.SuspectRecord, ...]
+    reliability: assessment_record.ReliabilityRecord | None
     cameras: Mapping[str, CameraRecord]
     scanners: Mapping[str, ScannerRecord] = field(default_factory=dict)
     boards: Mapping[str, BoardRecord] = field(default_factory=dict)
     images: Mapping[str, ImageRecord]
     frames: Mapping[str, JoinedFrameRecord] = field(default_factory=dict)
     points: Mapping[str, PointRecord]
-    residuals: tuple[ResidualRecord, ...]
+    residuals: tuple[assessment_record.ResidualRecord, ...]
     refraction: Flag = False
     earth_curvature: Flag = False
-    distances: tuple[DistanceRecord, ...]
-    fiducial_distances: tuple[FiducialDistanceRecord, ...] = ()
-    calibrations: tuple[ObservedQuantity, ...]
-    calibration_tests: tuple[ContradictionRecord, ...] = ()
-    antennas: tuple[ObservedQuantity, ...]
+    distances: tuple[assessment_record.DistanceRecord, ...]
+    fiducial_distances: tuple[assessment_record.FiducialDistanceRecord, ...] = ()
+    calibrations: tuple[assessment_record.ObservedQuantity, ...]
+    calibration_tests: tuple[assessment_record.ContradictionRecord, ...] = ()
+    antennas: tuple[assessment_record.ObservedQuantity, ...]
     groups: Mapping[str, Annotated[Group, FOREIGN]]
     history: tuple[Annotated[Iteration, FOREIGN], ...] = ()
 

@@ -16,15 +16,7 @@ from types import NoneType
 from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    GetCoreSchemaHandler,
-    PlainValidator,
-    Strict,
-    TypeAdapter,
-    ValidationError,
-    model_validator,
-)
+import pydantic
 
 from pipeline.errors import InputError
 from pipeline.text.files import parse_json, quote_value, read_bytes, write_atomically
@@ -61,12 +53,12 @@ def _wrong(value: Any, expected: str) -> str:
     return f"is {quote_value(value)}; it should be {expected}"
 
 
-Flag = Annotated[bool, Strict()]
-Whole = Annotated[int, Strict()]
-Number = Annotated[float, PlainValidator(_number)]
-Sigma = Annotated[float, PlainValidator(_sigma)]
-NumberOrNone = Annotated[float | None, PlainValidator(_number)]
-Finite = Annotated[float, PlainValidator(_finite)]
+Flag = Annotated[bool, pydantic.Strict()]
+Whole = Annotated[int, pydantic.Strict()]
+Number = Annotated[float, pydantic.PlainValidator(_number)]
+Sigma = Annotated[float, pydantic.PlainValidator(_sigma)]
+NumberOrNone = Annotated[float | None, pydantic.PlainValidator(_number)]
+Finite = Annotated[float, pydantic.PlainValidator(_finite)]
 _EXPECTED = {
     "string_type": "a text", "bool_type": "true or false", "int_type": "a whole number", "float_type": "a number",
     "dict_type": "a table", "dataclass_type": "a table",
@@ -76,11 +68,13 @@ _EXPECTED = {
 class _Foreign:
     """Note on a record of another package: its numbers are read as those of the records here."""
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> Any:
+    def __get_pydantic_core_schema__(self, source: Any, handler: pydantic.GetCoreSchemaHandler) -> Any:
         types: Any = {bool: Flag, int: Whole, float: Number, tuple[float, float]: tuple[Number, Number]}
         hints = {name: types.get(hint, hint) for name, hint in get_type_hints(source).items()}
         stand_in: Any = make_dataclass(source.__name__, hints.items())
-        return handler.generate_schema(Annotated[stand_in, AfterValidator(lambda value: source(**vars(value)))])
+        return handler.generate_schema(
+            Annotated[stand_in, pydantic.AfterValidator(lambda value: source(**vars(value)))]
+        )
 
 
 FOREIGN = _Foreign()
@@ -92,7 +86,7 @@ class WithRest:
     __slots__ = ()
     rest: ClassVar[str]
 
-    @model_validator(mode="before")
+    @pydantic.model_validator(mode="before")
     @classmethod
     def _gathered(cls, value: Any) -> Any:
         if not isinstance(value, dict):
@@ -139,13 +133,13 @@ def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
     try:
         record: Record = _adapter(kind).validate_json(data)
         return record
-    except ValidationError as error:
+    except pydantic.ValidationError as error:
         parse_json(data, path)  # raises for a file that is no JSON
         place, problem = _place_and_problem(kind, error.errors(include_url=False)[0])
         raise InputError(f"{path}: {place or 'the file'} {problem}. {remedy}") from None
 
 
-_adapter: Callable[[Any], TypeAdapter[Any]] = cache(TypeAdapter)
+_adapter: Callable[[Any], pydantic.TypeAdapter[Any]] = cache(pydantic.TypeAdapter)
 
 
 def _place_and_problem(kind: Any, error: Any) -> tuple[str, str]:

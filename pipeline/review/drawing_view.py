@@ -26,21 +26,7 @@ from measure.scans.scan import Scan
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.mark_table import MARK_TABLES, Clicks, MarkJson, scaled_mark
-from pipeline.review.camera_drawing import (
-    MARK,
-    CameraDrawing,
-    ClickedMark,
-    FramePlacement,
-    camera_path,
-    drawn_camera,
-    frame_size_mm,
-    learned_remarks,
-    parse_drawing,
-    place_frame,
-    rotation,
-    save_drawing,
-    save_learned,
-)
+from pipeline.review import camera_drawing
 from pipeline.review.frame_view import camera_as_shown, check_clicks, outlines_px
 from pipeline.review.pictures import Pictures, window_start
 from pipeline.review.requests import DrawnCamera, Query, ShownMarks, parse_json, parse_values, whole
@@ -85,7 +71,7 @@ class DrawnMark:
     problem : why the drawing is incomplete.
     """
 
-    clicked: ClickedMark
+    clicked: camera_drawing.ClickedMark
     xy_mm: Point
     mark: Mark | None
     pixel_from_mark: Array
@@ -97,7 +83,7 @@ class DrawnMark:
         return -1.0 if self.xy_mm[0] > 0 else 1.0, -1.0 if self.xy_mm[1] > 0 else 1.0
 
 
-def drawn_mark(drawing: CameraDrawing, placement: FramePlacement) -> DrawnMark | None:
+def drawn_mark(drawing: camera_drawing.CameraDrawing, placement: camera_drawing.FramePlacement) -> DrawnMark | None:
     """Mark shown, None if none is selected."""
     clicked = next((one for one in drawing.marks if one.id == drawing.point), None)
     if clicked is None:
@@ -105,23 +91,23 @@ def drawn_mark(drawing: CameraDrawing, placement: FramePlacement) -> DrawnMark |
     xy = clicked.given_mm or placement.camera_mm(clicked.px)
     matrix = _pixel_from_mark(placement, clicked)
     try:
-        camera = drawn_camera(drawing, placement, _NO_FILE)
+        camera = camera_drawing.drawn_camera(drawing, placement, _NO_FILE)
     except InputError as error:
-        sentence = str(error).removeprefix(f"{_NO_FILE}: ").replace(f"[mark.{MARK}] ", "")
+        sentence = str(error).removeprefix(f"{_NO_FILE}: ").replace(f"[mark.{camera_drawing.MARK}] ", "")
         return DrawnMark(clicked, xy, None, matrix, sentence)
     mark = next(one.mark for one in camera.fiducials if one.id == clicked.id)
     return DrawnMark(clicked, xy, mark if isinstance(mark, Mark) else None, matrix)
 
 
-def _pixel_from_mark(placement: FramePlacement, clicked: ClickedMark) -> Array:
-    turn = rotation(math.radians(clicked.turn_deg))
+def _pixel_from_mark(placement: camera_drawing.FramePlacement, clicked: camera_drawing.ClickedMark) -> Array:
+    turn = camera_drawing.rotation(math.radians(clicked.turn_deg))
     return np.column_stack([turn @ placement.pixel_from_camera[:, :2], clicked.px])
 
 
-def drawing_json(drawing: CameraDrawing, placement: FramePlacement) -> Json:
+def drawing_json(drawing: camera_drawing.CameraDrawing, placement: camera_drawing.FramePlacement) -> Json:
     """JSON of a drawing as shown on the page, without images."""
     shown = drawn_mark(drawing, placement)
-    frame_mm = frame_size_mm(drawing, placement)
+    frame_mm = camera_drawing.frame_size_mm(drawing, placement)
     return {
         "mark": drawing.mark,
         "marks": [{**asdict(one), "found_mm": placement.camera_mm(one.px)} for one in drawing.marks],
@@ -145,7 +131,7 @@ def _form(mark: MarkJson) -> list[Json]:
     return form
 
 
-def _shown_json(drawing: CameraDrawing, shown: DrawnMark) -> Json:
+def _shown_json(drawing: camera_drawing.CameraDrawing, shown: DrawnMark) -> Json:
     own = list(handles(drawing.mark, shown.toward))
     place = _handle_affine(drawing, shown)
     lines = [] if shown.mark is None else outlines_px(shown.mark, shown.pixel_from_mark)
@@ -172,7 +158,7 @@ def _half_px(shown: DrawnMark, lines: Sequence[Any], place: Affine, own: Sequenc
     return max(_LEAST_PX, math.ceil(_SIZES * off))
 
 
-def _handle_affine(drawing: CameraDrawing, shown: DrawnMark) -> Affine:
+def _handle_affine(drawing: camera_drawing.CameraDrawing, shown: DrawnMark) -> Affine:
     """Affine from the axes in which a mark is drawn to the scan; those of a radial mark turn with its position."""
     linear = shown.pixel_from_mark[:, :2]
     if drawing.mark.get("rotate") == "radial":
@@ -181,7 +167,9 @@ def _handle_affine(drawing: CameraDrawing, shown: DrawnMark) -> Affine:
     return Affine.from_linear(linear, shown.clicked.px)
 
 
-def take_step(drawing: CameraDrawing, placement: FramePlacement, step: Mapping[str, Any], scan: Scan) -> CameraDrawing:
+def take_step(
+    drawing: camera_drawing.CameraDrawing, placement: camera_drawing.FramePlacement, step: Mapping[str, Any], scan: Scan
+) -> camera_drawing.CameraDrawing:
     """Apply a step of the user to the drawing.
 
     Parameters
@@ -224,12 +212,14 @@ def take_step(drawing: CameraDrawing, placement: FramePlacement, step: Mapping[s
     raise InputError("that is no step of a drawing.")
 
 
-def _move_drawing(drawing: CameraDrawing, px: Point) -> CameraDrawing:
+def _move_drawing(drawing: camera_drawing.CameraDrawing, px: Point) -> camera_drawing.CameraDrawing:
     marks = tuple(replace(one, px=px, unfitted="") if one.id == drawing.point else one for one in drawing.marks)
     return replace(drawing, marks=marks)
 
 
-def fit_drawing(drawing: CameraDrawing, placement: FramePlacement, scan: Scan) -> CameraDrawing:
+def fit_drawing(
+    drawing: camera_drawing.CameraDrawing, placement: camera_drawing.FramePlacement, scan: Scan
+) -> camera_drawing.CameraDrawing:
     """Fit the drawing to all marks by the method of `measure`.
 
     Each mark gets its own position and blur. All get the median rotation, and the drawing is scaled by the median
@@ -237,8 +227,8 @@ def fit_drawing(drawing: CameraDrawing, placement: FramePlacement, scan: Scan) -
     """
     if drawing.is_picture:
         raise InputError("a square of the scan is its own picture: there is nothing to fit.")
-    camera = drawn_camera(drawing, placement, _NO_FILE)
-    marks, scales, turns_deg, reasons = list[ClickedMark](), list[float](), list[float](), list[str]()
+    camera = camera_drawing.drawn_camera(drawing, placement, _NO_FILE)
+    marks, scales, turns_deg, reasons = list[camera_drawing.ClickedMark](), list[float](), list[float](), list[str]()
     known = camera.layout_marks if camera.frame_mm is None else limit_to_frame(camera.layout()).marks
     for one, fiducial in zip(drawing.marks, known, strict=True):
         start = _pixel_from_mark(placement, replace(one, turn_deg=0.0))
@@ -279,7 +269,7 @@ class DrawingAnswers:
     def draw(self, query: Query, body: Any) -> Any:
         """Apply a step to the drawing; returns the drawing as shown."""
         given = parse_values(DrawnCamera, body)
-        drawing = parse_drawing(given.drawing)
+        drawing = camera_drawing.parse_drawing(given.drawing)
         placement = self._placement(drawing)
         if step := given.step:
             scan = self._session.scan_location(drawing.image)
@@ -288,7 +278,7 @@ class DrawingAnswers:
 
     def picture(self, query: Query) -> bytes:
         """Rendered drawing or residual image around the mark shown."""
-        drawing = parse_drawing(parse_json(query.get("drawing", "")))
+        drawing = camera_drawing.parse_drawing(parse_json(query.get("drawing", "")))
         half, shown = whole(query, "half", 8, _WIDEST_PX), drawn_mark(drawing, self._placement(drawing))
         if shown is None or not isinstance(shown.mark, MarkShape):
             raise MeasurementError("nothing is drawn there")
@@ -300,28 +290,32 @@ class DrawingAnswers:
     def save(self, query: Query, body: Any) -> Any:
         """Write the camera file; returns a message with the next step."""
         given = parse_values(DrawnCamera, body)
-        drawing = parse_drawing(given.drawing)
+        drawing = camera_drawing.parse_drawing(given.drawing)
         placement = self._placement(drawing)
-        project, path = self._session.project, camera_path(self._session.folder, given.file)
+        project, path = self._session.project, camera_drawing.camera_path(self._session.folder, given.file)
         if drawing.mark.get("kind") == "learned" and drawing.marks:
-            camera = drawn_camera(drawing, placement, path)
+            camera = camera_drawing.drawn_camera(drawing, placement, path)
             camera.layout()
             known = replace(project, pitch_um=placement.pitch_um, pose="auto")
             clicks = Clicks(drawing.image, {one.id: one.px for one in drawing.marks}, who=self._session.who)
             learned = camera_as_shown(known, camera, clicks)
-            return self._saved(save_learned(learned, learned_remarks(drawing.image), path))
+            return self._saved(
+                camera_drawing.save_learned(learned, camera_drawing.learned_remarks(drawing.image), path)
+            )
         scan = self._session.scan_location(drawing.image)
-        return self._saved(self._pictures.compute(scan, lambda file: save_drawing(drawing, placement, file, path)))
+        return self._saved(
+            self._pictures.compute(scan, lambda file: camera_drawing.save_drawing(drawing, placement, file, path))
+        )
 
     def save_learned(self, query: Query, body: Any) -> Any:
         """Write a camera of the project with marks learned at clicked places of one scan."""
         given = parse_values(ShownMarks, body)
-        path, project = camera_path(self._session.folder, given.file), self._session.project
+        path, project = camera_drawing.camera_path(self._session.folder, given.file), self._session.project
         self._session.scan_location(given.image)  # raises KeyError for an unknown image
         camera = project.image_camera(given.image)
         check_clicks(camera, given.image, given.px)
         learned = camera_as_shown(project, camera, Clicks(given.image, given.px, who=self._session.who))
-        return self._saved(save_learned(learned, learned_remarks(given.image), path))
+        return self._saved(camera_drawing.save_learned(learned, camera_drawing.learned_remarks(given.image), path))
 
     def _saved(self, camera: CameraFile) -> Any:
         file, project = camera.path.name, self._session.project
@@ -329,11 +323,11 @@ class DrawingAnswers:
         first = "" if file in names else f'name it in the project, camera = "{file}", then '
         return {"text": f"Saved {camera.path} with {len(camera.fiducials)} marks. Next: {first}reseau measure."}
 
-    def _placement(self, drawing: CameraDrawing) -> FramePlacement:
+    def _placement(self, drawing: camera_drawing.CameraDrawing) -> camera_drawing.FramePlacement:
         project = self._session.project
         size_px, file_um = self._pictures.size(self._session.scan_location(drawing.image))
         known_um: Point | None = project.pitch_um or file_um
-        return place_frame(
+        return camera_drawing.place_frame(
             drawing, size_px, known_um, "as the project says" if project.pitch_um else "as the file says"
         )
 

@@ -139,9 +139,7 @@ class LookedAt:
     def frame_json(self) -> Json:
         """JSON of a frame with all marks except tie points."""
         frame, pose = self.scan.frame, self.scan.frame.pose
-        marks = [
-            {**mark_json(mark), "place": _pair(self._known_place(mark))} for mark in frame.marks if mark.kind != "tie"
-        ]
+        marks = [{**mark_json(m), "place": _pair(self._known_place(m))} for m in frame.marks if m.kind != "tie"]
         return {
             **self._head_json(),
             "pitch_um": [value for value in self.scan.pitch_um if np.isfinite(value)],

@@ -22,15 +22,7 @@ from pipeline.archive.results_database import Store
 from pipeline.archive.schema import check_judging, damaged_frames, damaged_result
 from pipeline.archive.verdicts import Verdict
 from pipeline.errors import InputError
-from pipeline.files.decisions_file import (
-    LEARNED,
-    Choice,
-    Decision,
-    append_decisions,
-    learned_from,
-    read_decisions,
-    standing,
-)
+from pipeline.files import decisions_file
 from pipeline.files.project_file import Project, reload_decisions
 from pipeline.measuring.learn_stage import add_learned_marks
 from pipeline.provenance import FileState, content_hash, file_state
@@ -248,17 +240,17 @@ class Session:
                 self._take_queue(row)
             elif self._file_state == before:
                 return
-            decisions = read_decisions(path)
-            self._standing = standing(decisions)
-            self._learned = [one for one in decisions if one.subject[2] == LEARNED]
-            self._of_image = defaultdict[str, list[Decision]](list)
+            decisions = decisions_file.read_decisions(path)
+            self._standing = decisions_file.standing(decisions)
+            self._learned = [one for one in decisions if one.subject[2] == decisions_file.LEARNED]
+            self._of_image = defaultdict[str, list[decisions_file.Decision]](list)
             for one in self._standing.values():
                 self._of_image[one.image].append(one)
             self._answers = {
                 key: answer for key, entry in self._by_key.items() if (answer := self._find_answer(entry)) is not None
             }
 
-    def decide(self, decisions: Sequence[Decision], key: str = "") -> None:
+    def decide(self, decisions: Sequence[decisions_file.Decision], key: str = "") -> None:
         """Append decisions to the file, all or none. key: of a question about several frames; the decisions then apply
         to all of them. Raises InputError for an invalid decision, and KeyError for an obsolete question."""
         when = datetime.now(UTC).isoformat(timespec="seconds")
@@ -270,7 +262,7 @@ class Session:
                 frames = tuple(zip(entry.images, entry.fingerprints, strict=True))
                 decisions = [replace(one, image=image, fingerprint=own) for one in decisions for image, own in frames]
             complete = [replace(self._add_fingerprint(one), who=self.who, when=when) for one in decisions]
-            append_decisions(self.project.decisions_path, complete)
+            decisions_file.append_decisions(self.project.decisions_path, complete)
             self.refresh()
 
     def page(self, filters: Filters, start: int = 0) -> Json:
@@ -337,9 +329,9 @@ class Session:
         with self._lock:
             return [_answer_json(one) for one in self._scan_decisions(image)]
 
-    def _scan_decisions(self, image: str) -> list[Decision]:
+    def _scan_decisions(self, image: str) -> list[decisions_file.Decision]:
         """Decisions in force on the marks and the pose of an image."""
-        return [one for one in self._of_image.get(image, ()) if one.subject[2] != LEARNED]
+        return [one for one in self._of_image.get(image, ()) if one.subject[2] != decisions_file.LEARNED]
 
     def _take_queue(self, judging: int) -> None:
         self.project = self.learned = reload_decisions(self.project)
@@ -351,14 +343,14 @@ class Session:
                 queue = build_queue(self.project, store.connection, judging)
         self._by_key, self._judging = {entry.key: entry for entry in queue}, judging
 
-    def _find_answer(self, entry: Entry) -> Decision | None:
+    def _find_answer(self, entry: Entry) -> decisions_file.Decision | None:
         """Decision that answers a question; None if it is open."""
         # One about several frames needs decisions on all. A changed pose answers those about marks: it renames them.
         if entry.question is not Question.CAMERA and entry.images[0] not in self._of_image:
             return None
         match entry.question:
             case Question.CAMERA:
-                return learned_from(self._learned, frozenset(entry.images))
+                return decisions_file.learned_from(self._learned, frozenset(entry.images))
             case Question.FRAME:
                 made = self._scan_decisions(entry.images[0])
                 return next((one for one in reversed(made) if _names_result(one, entry.fingerprints[0])), None)
@@ -381,18 +373,18 @@ class Session:
         one = self._standing.get((entry.images[0], entry.point, entry.kind))
         return None if one is None or _names_result(one, entry.fingerprints[0]) else _answer_json(one)
 
-    def _add_fingerprint(self, one: Decision) -> Decision:
+    def _add_fingerprint(self, one: decisions_file.Decision) -> decisions_file.Decision:
         """Add the fingerprint of the scan to a decision to learn marks, so that it applies to this file only."""
-        is_learned = one.decision is Choice.LEARN
+        is_learned = one.decision is decisions_file.Choice.LEARN
         return replace(one, fingerprint=content_hash(self.project.scans[one.image])) if is_learned else one
 
-    def _check(self, one: Decision) -> None:
+    def _check(self, one: decisions_file.Decision) -> None:
         """Check that image and mark exist and the decision is possible. Raises InputError otherwise."""
-        if one.subject[2] == LEARNED:
+        if one.subject[2] == decisions_file.LEARNED:
             if one.image not in self.project.scans:
                 raise InputError(f"there is no image or mark {one.image!r}.")
             wanted = {mark.id for mark in self.project.image_camera(one.image).learned}
-            if one.decision is Choice.LEARN and set(one.px) != wanted:
+            if one.decision is decisions_file.Choice.LEARN and set(one.px) != wanted:
                 marks = ", ".join(sorted(wanted))
                 raise InputError(f"{one.image}: click {marks}: all marks of its camera, and no others.")
             return
@@ -401,17 +393,19 @@ class Session:
             mark = view.mark(one.point, one.subject[2]) if one.point else None
         except KeyError as error:
             raise InputError(f"there is no image or mark {error.args[0]!r}.") from None
-        if one.decision in (Choice.ACCEPT, Choice.REJECT) and (mark is None or mark.covariance is None):
+        if one.decision in (decisions_file.Choice.ACCEPT, decisions_file.Choice.REJECT) and (
+            mark is None or mark.covariance is None
+        ):
             raise InputError(
                 f"{one.image}, {one.point}: nothing was measured that could be {one.decision}ed. Place it with a click."
             )
 
 
-def _names_result(one: Decision, fingerprint: str) -> bool:
+def _names_result(one: decisions_file.Decision, fingerprint: str) -> bool:
     """Whether a decision refers to the current result."""
     return one.fingerprint in ("", fingerprint)
 
 
-def _answer_json(one: Decision) -> Json:
+def _answer_json(one: decisions_file.Decision) -> Json:
     names = ("decision", "image", "point", "pose", "note", "col_px", "row_px", "px", "who", "when")
     return {**{name: getattr(one, name) for name in names}, "kind": one.subject[2]}

@@ -15,12 +15,7 @@ from pipeline.text.wording import nearest
 MOST_MB = 200  # MB; a comparator file of 50,000 scans has 50
 SHOWN = 60  # characters of a wrong value quoted in a message
 
-_KINDS = {
-    stat.S_ISFIFO: "a pipe",
-    stat.S_ISCHR: "a device",
-    stat.S_ISBLK: "a device",
-    stat.S_ISSOCK: "a socket",
-}
+_KINDS = {stat.S_ISFIFO: "a pipe", stat.S_ISCHR: "a device", stat.S_ISBLK: "a device", stat.S_ISSOCK: "a socket"}
 LARGEST = 1e15  # limit of coordinates, sizes and standard deviations, any unit: squares of larger ones lose precision
 FilePath = str | os.PathLike[str]
 SMALLEST_SIGMA = 1e-9  # limit of standard deviations, mm, m or degrees: weights of smaller ones dominate all others

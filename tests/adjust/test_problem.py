@@ -108,10 +108,7 @@ GALLERY: dict[str, tuple[Change, list[str]]] = {
     ),
     "distance to no fiducial": (lambda n: set_fiducial_distance(n, "1", "9", 150.0, 0.01), ["has no fiducial 9"]),
     "fiducial to itself": (lambda n: set_fiducial_distance(n, "1", "1", 150.0, 0.01), ["same point at both ends"]),
-    "fiducials below zero": (
-        lambda n: set_fiducial_distance(n, "1", "2", -150.0, 0.01),
-        ["must be a positive number"],
-    ),
+    "fiducials below zero": (lambda n: set_fiducial_distance(n, "1", "2", -150.0, 0.01), ["must be a positive number"]),
     "exact fiducials": (
         lambda n: set_fiducial_distance(n, "1", "2", 150.0, 0.0),
         ["needs a positive standard deviation"],

@@ -4,8 +4,6 @@ import io
 import json
 import os
 import re
-import resource
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -29,7 +27,6 @@ from projects import (
 from rich.console import Console
 from studies import parametrize_with_studies
 
-from pipeline import stages
 from pipeline.archive.verdicts import Verdict
 from pipeline.commands.shared import command_step, print_next, summary_steps
 from pipeline.progress import Reporter, time_left
@@ -147,21 +144,6 @@ def test_a_folder_in_place_of_a_project_is_answered_by_what_it_holds(tmp_path: P
     assert words in refusal("adjust", tmp_path)
 
 
-def test_full_disk_gets_a_message_and_leaves_earlier_results(project: Path, capsys: Capture) -> None:
-    before = results(project)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
-        code = command("adjust", project / "project.toml")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, handler)
-    assert code == 2
-    assert "Make room there" in capsys.readouterr().err
-    assert results(project) == before
-
-
 def pixels_for_mm(rows: list[str]) -> list[str]:
     cells = [row.split(",") for row in rows]
     return [",".join([*row[:3], row[8], row[9], *row[5:]]) for row in cells if row[8]]
@@ -191,15 +173,6 @@ def test_marks(project: Path, capsys: Capture, change: Callable[[list[str]], lis
     assert [word for word in words if word not in out + err] == []
     assert code == (0 if "frames" in words[0] else 2)
     assert code or any("999" in note for note in result_file(project)["notes"])
-
-
-def test_an_interrupt_has_a_code_of_its_own(project: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(stages, "run_adjust", interrupted)
-    assert command("adjust", project / "project.toml") == 130
-    assert "interrupted; files that were complete stay" in capsys.readouterr().err
 
 
 def test_singular_network_is_named_in_words(project: Path, printed: Printed) -> None:

@@ -30,7 +30,6 @@ from measure.marks.shapes import Mark, MarkShape, Polygon
 from measure.scans.metadata import Pitch
 from measure.scans.opening import ScanHead, read_head
 from pipeline import read_project, stages
-from pipeline.archive import new_project
 from pipeline.archive.scan_groups import Catalogue, Sample, ScanGroup, catalogue, identify_sample, name_cameras
 from pipeline.files import library
 from pipeline.files.camera_file import read_camera
@@ -114,7 +113,7 @@ def fake_cameras(monkeypatch: pytest.MonkeyPatch, sample: Callable[[ScanGroup], 
     def samples(grouped: Catalogue, *_: object) -> Catalogue:
         return replace(grouped, groups=tuple(fake_group(group, sample(group)) for group in grouped.groups))
 
-    monkeypatch.setattr(new_project, "name_cameras", samples)
+    monkeypatch.setattr("pipeline.archive.scan_groups.name_cameras", samples)
 
 
 def test_a_camera_is_known_by_most_samples_and_by_what_its_plate_does_not_contradict(box: Path) -> None:

@@ -171,14 +171,6 @@ def test_failed_scans(two: Path, monkeypatch: pytest.MonkeyPatch, error: Excepti
     assert [(mark.point, mark.status) for mark in scan.frame.marks] == [(id, Status.ABSENT) for id in "1234"]
 
 
-def test_a_thresholded_scan_is_refused(tmp_path: Path) -> None:
-    project = write_project(tmp_path, ["a"])
-    grey = tifffile.imread(tmp_path / "a.tif")
-    tifffile.imwrite(tmp_path / "a.tif", 255 * (grey > np.median(grey)).astype(np.uint8))
-    scan = measured_scan(scan_tasks(read_project(project), ["a"])[0])
-    assert "has black and white pixels only" in present(scan.failure).sentence
-
-
 def test_a_failed_scan_has_a_row_for_each_target(tmp_path: Path) -> None:
     a, _ = make_tasks(tmp_path, PROJECT + BOARD)
     scan = measured_scan(a)  # an empty file
@@ -475,7 +467,7 @@ def test_init_of_a_bucket(store: Any, local: Path, tmp_path: Path, monkeypatch: 
     def unnamed(grouped: Catalogue, *_: Any) -> Catalogue:
         return grouped
 
-    monkeypatch.setattr("pipeline.archive.new_project.name_cameras", unnamed)
+    monkeypatch.setattr("pipeline.archive.scan_groups.name_cameras", unnamed)
     assert command("init", "s3://boxes/1952/", "--out", tmp_path) == 1
     text = (tmp_path / "project.toml").read_text()
     assert 'scans = ["s3://boxes/1952/**/*.tif"]' in text

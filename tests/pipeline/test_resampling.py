@@ -275,7 +275,8 @@ def test_a_frame_whose_place_in_the_scan_is_in_doubt_says_so(tmp_path: Path, mon
     written = read_project(tmp_path / "project.toml")
     stage = "pipeline.resampling.resample_stage"
     monkeypatch.setattr(f"{stage}.read_comparator", lambda *given: ())
-    monkeypatch.setattr(f"{stage}.image_chain", lambda *given: FrameChain(PITCH_UM, film(0.4, False)[0]))
+    chain = FrameChain(PITCH_UM, film(0.4, False)[0])
+    monkeypatch.setattr("pipeline.resampling.canvas.image_chain", lambda *given: chain)
     assumed = "scan orientation 90 is assumed"
     for is_oriented, doubt in ((None, assumed), (False, assumed), (True, "")):
         record = SimpleNamespace(exterior=SimpleNamespace(is_oriented=is_oriented))

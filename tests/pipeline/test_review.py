@@ -284,18 +284,6 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "decisions.jsonl"
 
 
-def test_what_is_appended_is_read_again_but_for_a_line_cut_short(path: Path) -> None:
-    result = [
-        Decision("box/a", Choice.ACCEPT, "1", "fiducial", note="é <b>", who="ann", when="2026-01-01T10:00:00+00:00"),
-        place("2", 1.5, fingerprint="f", window=(1.0, 2.0, 81.0, 81.0)),
-        Decision("a", Choice.POSE, pose="90m"),
-        Decision("a", Choice.UNDO),
-    ]
-    append_decisions(path, result[:1])
-    append_decisions(path, result[1:])
-    assert read_decisions(path) == tuple(result)
-
-
 def test_a_line_cut_short_does_not_count_and_the_next_one_stands_by_itself(path: Path) -> None:
     append_decisions(path, [mark_decision(Choice.ACCEPT)])
     whole = path.read_bytes()

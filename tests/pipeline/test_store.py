@@ -108,19 +108,6 @@ def test_a_lot_whose_input_was_tested_is_not_tested_again(path: Path) -> None:
         assert list(comparator_lines(points, {})) == rows
 
 
-def test_one_judging_takes_the_place_of_another(path: Path) -> None:
-    with Store(path) as store:
-        row = store.keep(kept_result(1), "1")
-        first = judge(store, {}, "a", [CheckedResult(row, made_record())])
-        same = judge(store, {}, "a", [CheckedResult(row, made_record())])
-        second = judge(store, {}, "a", [CheckedResult(row, LOOKED_AT)])
-        assert first.digest == same.digest != second.digest
-        assert find_judging(store, first.digest) is not None
-        second.drop_others()
-        assert find_judging(store, first.digest) is None
-        assert latest(store) == second
-
-
 def test_a_step_to_a_later_version_is_made_whole_or_not_at_all(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with Store(path) as store:
         row = store.keep(kept_result(1), "1")
@@ -191,16 +178,6 @@ def test_what_was_kept_survives_a_kill_and_nothing_is_half(path: Path) -> None:
         assert 40 <= complete <= len(found) <= complete + 1
         assert all(store.scan(row, "", FOLDER).frame.marks for row in found.values())
         assert store.connection.execute("pragma integrity_check").fetchone() == ("ok",)
-
-
-def test_failed_scans_are_tried_again_only_when_requested(path: Path) -> None:
-    with Store(path) as store:
-        store.keep(kept_result(1), "1")
-        row = store.keep(kept_result(2, scan=failed(2)), "2")
-        assert store.connection.execute("select verdict from result where id = ?", (row,)).fetchone() == ("failed",)
-        assert store.forget_failed() == 1
-        assert list(store.fingerprints()) == [kept_result(1).fingerprint]
-        assert store.forget_failed() == 0
 
 
 def test_verdicts_of_scans() -> None:
