@@ -5,8 +5,9 @@ robust methods, are given points whose blunders are too large for coordinates as
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 from typing import NamedTuple
 
@@ -16,15 +17,13 @@ from scipy.special import chdtrc
 
 from adjust.array_types import Array
 from adjust.errors import AdjustmentError, DatumError, NoImageError, UnorientedError
-from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Prior
 from adjust.initial_values.approximations import initial_values
 from adjust.initial_values.mismatches import Mismatches, find_mismatches, started_rays
 from adjust.initial_values.pose import intersect
 from adjust.least_squares.malloc_tuning import keep_freed_memory, pause_cycle_search
-from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Network, ObjectPoint
-from adjust.problem.parameter import Parameter, shortened
+from adjust.problem.parameter import shortened
 from adjust.problem.problem import Problem, number, number_reduced
 from adjust.problem.unknowns import Reduction
 from adjust.quality.variance_components import added_variance
@@ -36,6 +35,13 @@ from adjust.solution.blunder_hypotheses import (
     misnumbered_images,
     stations_elsewhere,
 )
+from adjust.solution.contradicting_images import (
+    adopt_lens,
+    fitting,
+    is_of_some_frames,
+    leave_out,
+    leave_out_contradicting,
+)
 from adjust.solution.options import Datum, Method, Options
 from adjust.solution.result import Adjustment, adjust_problem
 from adjust.validation import validate
@@ -44,11 +50,8 @@ __all__ = ["Datum", "Method", "Options", "adjust", "adjust_unmodelled"]
 
 GUESSED = 0.1  # relative standard deviation of a principal distance above which the value is a guess
 TRIAL_STEPS = 6  # iterations of a trial adjustment, enough to test v'Pv, which decreases with each
-FITTING = 3.0  # in sigma0 of the others: largest rms standardised residual of an image that agrees with them
-CONTRADICTING = 0.5  # share of v'Pv of a camera's images above which one of them explains what is wrong
-WHOLE = 3.0  # in given standard deviations: median residual of an image that contradicts the others as a whole
-FEWEST_RAYS = 2  # rays needed for a point without priors
 NAMED = 5  # images named in a message
+CLEARER = 3.0  # factor by which errors fall without images that contradict the others
 ROUNDS = 6  # two or three suffice: nearly equal weights hardly change the residuals
 FIRST = 1e-3  # initial value, fraction of the frame's diagonal: above any lens misfit, below a blunder
 PLAUSIBLE = 3e-4  # fraction of the frame's diagonal that lens, board and processing may cause: 1.5 px of 5000 px
@@ -96,8 +99,8 @@ def adjust(
         validate(network)
         solver = _Solver(options or Options())
         if approximations is None:
-            result, left_out = solver.leave_out_blind(*solver.orientable(network))
-            found = solver.try_again(network, result, left_out) if left_out else result
+            result = solver.adjust_orientable(*solver.orientable(network))
+            found = solver.try_again(network, result) if result.left_out else result
         else:
             found = solver.check_whole(network, approximations, None)
         return check_plausibility(found, solver.trials)
@@ -109,8 +112,8 @@ def adjust_unmodelled(network: Network, options: Options | None = None) -> Adjus
     It is added in quadrature to those of the camera's targets and tie points, such that their v'Pv equals their
     redundancy (Förstner's condition for a variance component, here an additive one). It is 0 where the given standard
     deviations explain the residuals. The first adjustment allows FIRST of the frame's diagonal, so that blunders of the
-    whole network are refused before an error is attributed to unmodelled effects. An implausibly large one is a
-    warning.
+    whole network are refused before an error is attributed to unmodelled effects. Images without which errors are
+    CLEARER times smaller are left out; an implausibly large one is a warning.
 
     Parameters
     ----------
@@ -122,8 +125,39 @@ def adjust_unmodelled(network: Network, options: Options | None = None) -> Adjus
     Adjustment
         With the added standard deviations in `unmodelled_mm`. Raises AdjustmentError as `adjust` does.
     """
-    diagonal_mm = {each.name: float(np.hypot(*each.frame_mm)) for each in network.cameras}
-    sigma_mm = {each: FIRST * diagonal_mm[each] for each in diagonal_mm}
+    options = options or Options()
+    first = _fit_unmodelled(network, options)
+    plausible_mm = {each.name: PLAUSIBLE * float(np.hypot(*each.frame_mm)) for each in network.cameras}
+    doubtful = [
+        name
+        for name, limit_mm in plausible_mm.items()
+        if limit_mm and (first.unmodelled_mm[name] > limit_mm or is_of_some_frames(first, name))
+    ]
+
+    def agrees(result: Adjustment) -> bool:
+        return result.converged and all(
+            result.unmodelled_mm[name] <= plausible_mm[name]
+            and CLEARER * _marks_sigma_mm(result, name) <= _marks_sigma_mm(first, name)
+            for name in doubtful
+        )
+
+    result = first
+    if doubtful:
+        refitted = partial(_fit_unmodelled, options=options)
+        result = leave_out_contradicting(network, first, refitted, agrees, several=True)
+    warnings = (
+        f"Camera {name}: errors of {1000.0 * sigma_mm:.3g} µm are not modelled, one part in "
+        f"{plausible_mm[name] / PLAUSIBLE / sigma_mm:.0f} of the picture's diagonal. Look for pictures that are "
+        "blurred or moved, for a wrong size or count of the board, and whether the lens model suits."
+        for name, sigma_mm in result.unmodelled_mm.items()
+        if sigma_mm > plausible_mm[name] > 0.0
+    )
+    return replace(result, remarks=(*result.remarks, *warnings))
+
+
+def _fit_unmodelled(network: Network, options: Options) -> Adjustment:
+    """Adjust a network with standard deviations of unmodelled errors by camera that its residuals confirm."""
+    sigma_mm = {each.name: FIRST * float(np.hypot(*each.frame_mm)) for each in network.cameras}
     result = adjust(add_unmodelled(network, sigma_mm), options=options)
     for _ in range(ROUNDS):
         if not result.converged:
@@ -132,14 +166,7 @@ def adjust_unmodelled(network: Network, options: Options | None = None) -> Adjus
         if all(abs(sigma_mm[each] - before[each]) <= SETTLED * sigma_mm[each] for each in sigma_mm):
             break
         result = adjust(add_unmodelled(network, sigma_mm), result.start, options)
-    large = [each for each in sigma_mm if sigma_mm[each] > PLAUSIBLE * diagonal_mm[each] > 0.0]
-    warnings = (
-        f"Camera {each}: errors of {1000.0 * sigma_mm[each]:.3g} µm are not modelled, one part in "
-        f"{diagonal_mm[each] / sigma_mm[each]:.0f} of the picture's diagonal. Look for pictures that are blurred or "
-        "moved, for a wrong size or count of the board, and whether the lens model suits."
-        for each in large
-    )
-    return replace(result, unmodelled_mm=sigma_mm, remarks=(*result.remarks, *warnings))
+    return replace(result, unmodelled_mm=sigma_mm)
 
 
 def add_unmodelled(network: Network, sigma_mm: Mapping[str, float]) -> Network:
@@ -153,6 +180,12 @@ def _cameras(network: Network) -> NDArray[np.str_]:
     """Camera of every target and tie point; "" for other marks."""
     cameras = np.array([image.camera for image in network.images])[network.image_numbers]
     return np.where(np.isin(network.observations.kind, ("target", "tie")), cameras, "")
+
+
+def _marks_sigma_mm(result: Adjustment, camera: str) -> float:
+    """Rms standard deviation of a camera's marks, given and unmodelled."""
+    covariance_mm2 = result.network.observations.covariance_mm2[_cameras(result.network) == camera]
+    return float(np.sqrt(np.trace(covariance_mm2, axis1=1, axis2=2).mean() / 2.0))
 
 
 def _components_mm(result: Adjustment, before_mm: Mapping[str, float]) -> dict[str, float]:
@@ -217,32 +250,39 @@ class _Solver:
             return part, None, misnumbered
         return (part, None, misnumbered) if rest is None else (*rest, misnumbered | reasons)
 
-    def leave_out_blind(
-        self, part: Network, start: Approximations | None, left_out: dict[str, str]
-    ) -> tuple[Adjustment, dict[str, str]]:
-        """Adjust a network without the images that keep it from a solution; also return the reasons.
+    def adjust_orientable(self, part: Network, start: Approximations | None, left_out: Mapping[str, str]) -> Adjustment:
+        """Adjust a network without the images that contradict the others, as one may that keeps it from converging.
 
-        These are the images in which some point has no image at the start, and where the iteration does not converge,
-        or observations contradict each other, the one that contradicts the others most, if all is well without it.
+        left_out: reasons for images left out before.
+        """
+        first = found = self.adjust_without_blind(part, start)
+
+        def agrees(result: Adjustment) -> bool:
+            return result.converged and (not first.converged or self.trials.explains(result))
+
+        def adjusted(rest: Network) -> Adjustment:
+            return self.adjust_without_blind(rest, self.initial_values(rest))
+
+        if first.termination != "singular":
+            found = leave_out_contradicting(part, first, adjusted, agrees, several=False)
+        return replace(found, left_out={**left_out, **found.left_out})
+
+    def adjust_without_blind(self, part: Network, start: Approximations | None) -> Adjustment:
+        """Adjust a network without the images in which some point has no image at the start.
+
         Raises NoImageError where too little would remain.
         """
         try:
-            result = self.check_whole(part, None, start)
+            return self.check_whole(part, None, start)
         except NoImageError as error:
             if (rest := self.remainder(part, error.reasons)) is None:
                 raise
-            return self.leave_out_blind(*rest, left_out | error.reasons)
-        is_solved = result.termination == "singular" or (result.converged and self.trials.explains(result))
-        reasons = {} if is_solved else contradicting_image(result)
-        if (rest := self.remainder(part, reasons)) is None:
-            return result, left_out
-        without, more = self.leave_out_blind(*rest, left_out | reasons)
-        is_better = self.trials.explains(without) if result.converged else without.converged
-        return (without, more) if is_better else (result, left_out)
+            found = self.adjust_without_blind(*rest)
+            return replace(found, left_out={**error.reasons, **found.left_out})
 
-    def try_again(self, network: Network, rest: Adjustment, left_out: dict[str, str]) -> Adjustment:
+    def try_again(self, network: Network, rest: Adjustment) -> Adjustment:
         """Adjust with those left-out images that fit once the lens is known."""
-        found = rest
+        found, left_out = rest, rest.left_out
         if rest.converged:
             _, start, reasons = self.orientable(adopt_lens(network, rest))
             came = left_out.keys() - reasons.keys()
@@ -432,95 +472,6 @@ def _without(network: Network, mismatches: Mismatches) -> tuple[Network, dict[in
     distances = tuple(each for each in network.distances if not {each.start, each.end} & mismatches.unmet.keys())
     rest = replace(network, points=points, observations=network.observations.only(kept), distances=distances)
     return rest, doubted
-
-
-def leave_out(network: Network, frames: Collection[str]) -> Network | None:
-    """Remove some frames and what only they show from a network; None where no more than half of it would remain."""
-    left = {image.frame for image in network.images if image.frame not in frames}
-    if len(left) <= len(frames):
-        return None
-    images, observations = tuple(image for image in network.images if image.frame in left), network.observations
-    names = {image.name for image in images}
-    shown = np.isin(observations.image, list(names))
-    frames_of = defaultdict[str, set[str]](set)
-    for row in np.flatnonzero(shown & ~observations.is_fiducial):
-        frames_of[observations.point[row]].add(network.image_by_name[observations.image[row]].frame)
-    located = {
-        point.id
-        for point in network.points
-        if len(frames_of[point.id]) >= (FEWEST_RAYS if point.X is point.Y is point.Z is None else 1)
-    }
-    kept = shown & (observations.is_fiducial | np.isin(observations.point, list(located)))
-    return replace(
-        network,
-        images=images,
-        points=tuple(
-            point for point in network.points if point.id in located or point.id not in network.observed_points
-        ),
-        observations=observations.only(np.flatnonzero(kept)),
-        distances=tuple(each for each in network.distances if {each.start, each.end} <= located | names),
-    )
-
-
-def adopt_lens(network: Network, result: Adjustment) -> Network:
-    """Replace the cameras of a network by those adjusted from a part of it."""
-    used = {image.camera for image in result.network.images} - result.network.idle_cameras
-    cameras = (_adopt_camera(camera, result) if camera.name in used else camera for camera in network.cameras)
-    return replace(network, cameras=tuple(cameras))
-
-
-def fitting(result: Adjustment, frames: Collection[str], sigma0: float) -> set[str]:
-    """Select the frames whose residuals agree with sigma0 of the others."""
-    of_mark = np.array([image.frame for image in result.network.images])[result.network.image_numbers]
-    excess = (np.nan_to_num(result.residuals.w) ** 2).sum(axis=1) - 2.0 * (FITTING * sigma0) ** 2
-    return {frame for frame in frames if (result.weights * excess)[of_mark == frame].sum() <= 0.0}
-
-
-def contradicting_image(result: Adjustment) -> dict[str, str]:
-    """The frame that causes most of its camera's v'Pv, with the reason; empty if none does, or only by some marks."""
-    image_numbers, images = result.network.image_numbers, result.network.images
-    frames, cameras = np.array([(image.frame, image.camera) for image in images])[image_numbers].T
-    # Without a solution there are no standardised residuals.
-    variances = np.diagonal(result.network.observations.covariance_mm2, axis1=1, axis2=2)
-    share = (result.residuals.v_mm**2 / variances).sum(axis=1)
-    names, of_frame = np.unique(frames, return_inverse=True)
-    sums = np.bincount(of_frame, share)
-    worst = int(np.argmax(sums))
-    alike = cameras == cameras[np.argmax(of_frame == worst)]
-    if len(names) < 2 or sums[worst] <= CONTRADICTING * share[alike].sum():
-        return {}
-    name, own = str(names[worst]), np.where(of_frame == worst, share, -1.0)
-    if not result.converged:
-        point = result.network.observations.point[int(np.argmax(own))]
-        why = (
-            f"with image {name} the iteration does not converge, without it it does. Its largest residual is that of "
-            f"{point}. Check the point numbers of this image."
-        )
-        return {name: why}
-    if np.median(own[own >= 0.0]) < 2.0 * WHOLE**2:
-        return {}
-    why = (
-        f"all marks of image {name} contradict the other images, which agree without it. Check whether it is of "
-        "another size, pitch or camera than given, and its point numbers."
-    )
-    return {name: why}
-
-
-def _adopt_camera(camera: Camera, result: Adjustment) -> Camera:
-    def adopted(name: str, given: Prior | None) -> Prior:
-        return Prior(result.value(Parameter.interior(camera.name, name)), np.inf if given is None else given.sigma)
-
-    of = camera.distortion
-    parameters = {
-        name: adopted(name, of.parameters[name]) for name in parameter_names(of.family) if name in of.parameters
-    }
-    return replace(
-        camera,
-        principal_distance_mm=adopted("c", camera.principal_distance_mm),
-        x0_mm=adopted("x0", camera.x0_mm),
-        y0_mm=adopted("y0", camera.y0_mm),
-        distortion=replace(of, parameters=parameters),
-    )
 
 
 class _FarPoint(NamedTuple):

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import chain, combinations, product
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
@@ -28,7 +29,7 @@ from adjust.initial_values.dlt import linear_transformations
 from adjust.problem.camera import Camera
 from adjust.problem.condition_equations import observed_in_camera
 from adjust.problem.estimates import adjusted_image, adjusted_places
-from adjust.problem.network import Network, ObjectPoint
+from adjust.problem.network import Image, Network, ObjectPoint
 from adjust.problem.parameter import shortened
 from adjust.solution.result import Adjustment
 
@@ -119,15 +120,11 @@ def network_hypotheses(network: Network, bare: Network, given: Adjustment | None
 def _may_be_stretched(network: Network, given: Adjustment | None) -> bool:
     """Whether linear transformations of the given points fit all images, as with any units of the axes, and the
     adjustment as given misses the marks by as much as a wrong one makes it."""
-    places, observations, fits = network.known_places, network.observations, list[bool]()
     if given is not None and given.converged:
         miss_mm = np.sqrt(np.mean(given.residuals.v_mm**2))
-        fits.append(bool(miss_mm > LARGE * np.ptp(observations.xy_mm)))
-    for rows in _rows_of_given(network):
-        xyz = np.array([[places[observations.point[row]] for row in rows]])
-        (misfit,) = linear_transformations(xyz, observations.xy_mm[rows][None]).misfit
-        fits.append(bool(misfit < LARGE))
-    return all(fits)
+        if miss_mm <= LARGE * np.ptp(network.observations.xy_mm):
+            return False
+    return all(each.misfit < LARGE for each in _transformed_fields(network))
 
 
 def _one_axis(network: Network, axes: Sequence[int]) -> Iterator[NetworkHypothesis]:
@@ -135,17 +132,18 @@ def _one_axis(network: Network, axes: Sequence[int]) -> Iterator[NetworkHypothes
     extents = np.ptp(list(network.known_places.values()) or np.zeros((1, 3)), axis=0)
     for axis, factor in product((axis for axis in axes if extents[axis]), FACTORS):
         name, others = "XYZ"[axis], " and ".join("XYZ".replace("XYZ"[axis], ""))
-        times, how = max(factor, 1.0 / factor), "large" if factor < 1.0 else "small"
         by = np.diag(np.where(np.arange(3) == axis, factor, 1.0))
-        words = f"{name} of all points is {times:.4g} times too {how} for {others}: another unit"
+        words = f"{name} of all points is {_times_too(factor)} for {others}: another unit"
         yield NetworkHypothesis(words, _move_points(network, by), moved=by)
 
 
 def unit_words(factor: float) -> str:
     """Describe points in another unit; factor: multiplies them to correct it."""
-    how = "large" if factor < 1.0 else "small"
-    times = max(factor, 1.0 / factor)
-    return f"the coordinates of the points are {times:.4g} times too {how} for the stations or distances: another unit"
+    return f"the coordinates of the points are {_times_too(factor)} for the stations or distances: another unit"
+
+
+def _times_too(factor: float) -> str:
+    return f"{max(factor, 1.0 / factor):.4g} times too {'large' if factor < 1.0 else 'small'}"
 
 
 def _scaled(prior: Prior | None, factor: float) -> Prior | None:
@@ -184,13 +182,8 @@ def reversed_y(network: Network, keeps_given: bool = False) -> Network:
 
 def _mirrored_images(network: Network) -> Iterator[NetworkHypothesis]:
     """Hypothesis: those digital images are mirrored that a linear transformation of the given points shows so."""
-    observations, names = network.observations, list[str]()
-    for rows in _rows_of_given(network):
-        image = network.image_by_name[observations.image[rows[0]]]
-        if image.transformation == "none":
-            xyz = np.array([[network.known_places[observations.point[row]] for row in rows]])
-            (handedness,) = linear_transformations(xyz, observations.xy_mm[rows][None]).handedness
-            names += [image.name] if handedness > 0.0 else []
+    fields = _transformed_fields(network)
+    names = [each.image.name for each in fields if each.handedness > 0.0 and each.image.transformation == "none"]
     if 0 < len(names) < len(network.images):
         who = f"image {names[0]} is" if len(names) == 1 else f"the images {shortened(names, NAMED)} are"
         remedy = "Mirror these pictures and measure them again, or their coordinates in comparator.csv."
@@ -579,34 +572,22 @@ def _far_from_given(camera: Camera, found: Array, result: Adjustment, family: fl
 
 def misnumbered_images(network: Network) -> dict[str, str]:
     """Find the frames whose point numbers are off, with the reasons; empty where all may be right."""
-    places, observations = network.known_places, network.observations
-    names, number = observations.numbered_points
-    rows_of = _rows_of_given(network)
-    if len(rows_of) < FEWEST_IMAGES:
-        return {}
-    nowhere = np.full(3, np.nan)
-    given = np.array([places.get(name, nowhere) for name in names])[number]
-    as_given = np.empty(len(rows_of))
-    sizes = np.array([len(rows) for rows in rows_of])
-    for size in np.unique(sizes):
-        rows = np.array([each for each in rows_of if len(each) == size])
-        as_given[sizes == size] = linear_transformations(given[rows], observations.xy_mm[rows]).misfit
-    is_worse = as_given > WORSE * np.median(as_given)
-    doubted = np.flatnonzero(is_worse | (as_given > LARGE))
-    if not len(doubted):
+    places, observations, fields = network.known_places, network.observations, _transformed_fields(network)
+    limit = WORSE * float(np.median([each.misfit for each in fields])) if fields else 0.0
+    doubted = [each for each in fields if each.misfit > min(limit, LARGE)]
+    if len(fields) < FEWEST_IMAGES or not doubted:
         return {}
     in_order = sorted(places, key=_natural)
     place_of, xyz = {name: k for k, name in enumerate(in_order)}, np.array([places[name] for name in in_order])
     orders, frames = list(_orders(xyz)), defaultdict[str, list[str]](list)
-    for image in doubted:
-        rows = rows_of[image]
-        numbers = [place_of[observations.point[row]] for row in rows]
+    for each in doubted:
+        numbers = [place_of[observations.point[row]] for row in each.rows]
         reordered = np.array([xyz[order[numbers]] for _, order in orders])
-        xy_mm = np.broadcast_to(observations.xy_mm[rows], (*reordered.shape[:2], 2))
+        xy_mm = np.broadcast_to(observations.xy_mm[each.rows], (*reordered.shape[:2], 2))
         misfits = linear_transformations(reordered, xy_mm).misfit
         best = int(np.argmin(misfits))
-        if (BETTER if is_worse[image] else MUCH_BETTER) * misfits[best] < as_given[image]:
-            frames[orders[best][0]].append(network.image_by_name[observations.image[rows[0]]].frame)
+        if (BETTER if each.misfit > limit else MUCH_BETTER) * misfits[best] < each.misfit:
+            frames[orders[best][0]].append(each.image.frame)
     return {
         frame: f"the points of {shortened(some, NAMED)} are not numbered as they are given: {words}. Correct them."
         for words, some in frames.items()
@@ -614,14 +595,30 @@ def misnumbered_images(network: Network) -> dict[str, str]:
     }
 
 
-def _rows_of_given(network: Network) -> list[Indices]:
-    """Rows of the given points in every image that shows FEWEST of them."""
+class _TransformedField(NamedTuple):
+    """Linear transformation of the given points (n,) of an image to their marks: see `linear_transformations`."""
+
+    image: Image
+    rows: Indices
+    misfit: float
+    handedness: float
+
+
+def _transformed_fields(network: Network) -> list[_TransformedField]:
+    """Transform the given points of every image that shows FEWEST of them, many images at once."""
     names, number = network.observations.numbered_points
-    is_given = np.array([name in network.known_places for name in names], dtype=bool)[number]
-    rows = np.flatnonzero(is_given & ~network.observations.is_fiducial)
-    rows = rows[np.argsort(network.image_numbers[rows], kind="stable")]
+    nowhere, found = np.full(3, np.nan), dict[int, _TransformedField]()
+    given = np.array([network.known_places.get(name, nowhere) for name in names]).reshape(-1, 3)[number]
+    rows = np.flatnonzero(~np.isnan(given[:, 0]) & ~network.observations.is_fiducial)
     counts = np.bincount(network.image_numbers[rows], minlength=len(network.images))
-    return [own for own in np.split(rows, np.cumsum(counts)[:-1]) if len(own) >= FEWEST]
+    of_images = np.split(rows[np.argsort(network.image_numbers[rows], kind="stable")], np.cumsum(counts)[:-1])
+    for size in np.unique(counts[counts >= FEWEST]):
+        images = np.flatnonzero(counts == size)
+        some = np.array([of_images[image] for image in images])
+        fits = linear_transformations(given[some], network.observations.xy_mm[some])
+        columns = [network.images[image] for image in images], some, fits.misfit.tolist(), fits.handedness.tolist()
+        found |= zip(images.tolist(), map(_TransformedField._make, zip(*columns, strict=True)), strict=True)
+    return [found[image] for image in sorted(found)]
 
 
 def _natural(name: str) -> list[tuple[int, str]]:

@@ -25,7 +25,7 @@ orientations makes them, principal distances of their own scatter more than prin
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain, product
+from itertools import product
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -38,15 +38,7 @@ from adjust.quality.run import UM_PER_MM, GrossError, Run, residuals
 from adjust.quality.tested import Probabilities
 from adjust.quality.variance_components import added_variance, refined_factors
 from adjust.rank_defect.diagnosis import singular_directions
-from adjust.solution.model_hypotheses import (
-    ModelHypothesis,
-    camera_hypotheses,
-    estimate,
-    film_deformations,
-    image_jumps,
-    separate_lenses,
-)
-from adjust.solution.object_hypotheses import object_hypotheses
+from adjust.solution.model_hypotheses import ModelHypothesis, estimate, model_hypotheses, separate_lenses
 from adjust.solution.reweighting import again
 
 LEVEL = 0.001  # probability of reporting anything where the model is correct
@@ -233,13 +225,9 @@ class _Model:
 def _best(model: _Model) -> tuple[list[_Model], bool]:
     """Models with the best significant hypotheses, several where these are not distinguished."""
     # Also returns whether gross errors of single observations explain the residuals as well.
-    # Errors of a real board's points are part of the noise that is fitted: none of them is told but the worst.
     is_suspicious = model.exceeds(SUSPECTED) or bool(model.gross_errors)
-    most_points = 1 if model.unmodelled else len(model.run.problem.network.points) * is_suspicious
     tested = {board.name for board in model.run.problem.network.boards}
-    of_films = film_deformations(model.run) if is_suspicious else ()
-    of_scans = image_jumps(model.run) if is_suspicious or model.unmodelled else ()
-    rows = chain(camera_hypotheses(model.run), of_films, of_scans, object_hypotheses(model.run, most_points))
+    rows = model_hypotheses(model.run, is_suspicious, bool(model.unmodelled))
     falls = [(_first_order_fall(model.run, each.problem), each) for each in rows if each.name not in tested]
     level = LEVEL / max(len(falls), 1)
     worth = WORTH * max((fall for fall, _ in falls), default=0.0)

@@ -1,31 +1,42 @@
 """Hypotheses on errors of the model: larger problems that start where the adjustment without their unknowns ended.
 
-So one linearised step estimates the fall of v'Pv. The words of a hypothesis are made of the estimates of its unknowns.
-Here those of the cameras: lens terms, pixels, interior orientations.
+So one linearised step estimates the fall of v'Pv. The words of a hypothesis are made of the estimates of its unknowns:
+of the cameras (lens terms, pixels, interior orientations), of scans and films, and of the given points (a deformed
+object, disks of another diameter, wrong coordinates).
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
+from itertools import chain, combinations, product
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import KDTree
 
-from adjust.array_types import Array, Indices
+from adjust.array_types import Array, Indices, Mask
+from adjust.functional_model.board import BoardForm, board_form, disk_directions, strain_directions
 from adjust.functional_model.correction import AFFINITY_TERMS, ZERO, PolynomialTerms, Term, decentering, radial
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import INTERIOR_NAMES, Prior
 from adjust.functional_model.scanner import is_left
 from adjust.functional_model.transformation import LATTICE, film_kind, fit_transformation
 from adjust.problem.camera import Camera
-from adjust.problem.condition_equations import in_camera, object_displacements
+from adjust.problem.condition_equations import computed_observations, in_camera, object_displacements
 from adjust.problem.network import Approximations, Board, Network, Scanner, Transformation
 from adjust.problem.parameter import shortened
-from adjust.problem.problem import Problem, number
+from adjust.problem.problem import Problem, State, number
 from adjust.quality.cofactor import free_cofactor
 from adjust.quality.run import UM_PER_MM, Run, freed
-from adjust.solution.partitions import Selection, interior_equations, jumps, own_distances, two_groups
+from adjust.solution.partitions import (
+    Selection,
+    displaced_points,
+    interior_equations,
+    jumps,
+    own_distances,
+    two_groups,
+)
 
 FREE = Prior(0.0, np.inf)
 NONE = Selection()
@@ -40,6 +51,11 @@ RICHER: dict[Transformation, tuple[Transformation, ...]] = {  # film deformation
     "similarity": ("affine", "projective"),
     "affine": ("projective", "polynomial(2)"),
 }
+CLEAR = 3.0  # standard deviations above which one of two changes of a board is told
+FEWEST_GIVEN, FEWEST_IMAGES = 5, 2  # given points, and images of one, that tell a wrong one
+MISMEASURED = 0.1  # relative error of the given diameter of disks whose effect is reported
+MOST_NAMED = 10  # points named in a message
+INDEPENDENT = "points' unit; ± for independent errors, on real boards up to 5 times as much"
 ALIKE = 7.0  # difference of chi-square plus twice the unknowns below which two readings are not distinguished
 
 
@@ -67,6 +83,33 @@ class ModelHypothesis:
     limits: tuple[float, float] = (-np.inf, np.inf)  # possible values of the unknowns
     selection: Selection = NONE
     shown: Indices | None = None  # positions of the unknowns that the words tell; all those added where None
+
+
+OTHERS = " (other images)"  # suffix of a camera's name for the images with a different interior orientation
+
+
+def model_hypotheses(run: Run, is_suspicious: bool, is_fitted: bool) -> Iterator[ModelHypothesis]:
+    """All hypotheses that apply: on every camera, on scans and films, and on the given points.
+
+    is_suspicious: whether residuals are larger than the given standard deviations allow; is_fitted: whether those of
+    unmodelled errors were estimated from them.
+    """
+    network = run.problem.network
+    used = run.problem.unknowns.camera.keys() - network.idle_cameras
+    of_cameras = [_lens_terms, _drift, _wrong_interior_orientation]
+    if not any(each.name.endswith(OTHERS) for each in network.cameras):
+        of_cameras.append(_interior_orientations)
+    if is_suspicious or is_fitted:
+        of_cameras.append(_jumps)
+    yield from chain(*(kind(run, camera) for kind in of_cameras for camera in network.cameras if camera.name in used))
+    yield from _scanner_pixels(run)
+    if is_suspicious:
+        yield from film_deformations(run)
+    yield from _deformations(run)
+    yield from _disks(run)
+    # Errors of a real board's points are part of the noise that is fitted: none of them is told but the worst.
+    if is_suspicious or is_fitted:
+        yield from _wrong_points(run, 1 if is_fitted else len(network.points))
 
 
 def estimate(run: Run, hypothesis: ModelHypothesis, rms_um: float) -> Estimate:
@@ -152,20 +195,6 @@ def _in_kind(kind: Transformation, old: Transformation, parameters: Array, is_mi
     if kind == old:
         return parameters
     return fit_transformation(kind, LATTICE, film_kind(old, is_mirrored).apply(parameters, LATTICE))[0]
-
-
-OTHERS = " (other images)"  # suffix of a camera's name for the images with a different interior orientation
-
-
-def camera_hypotheses(run: Run) -> Iterator[ModelHypothesis]:
-    """Hypotheses on the model of every camera with images of object points, and on the scanner's pixels."""
-    network = run.problem.network
-    used = run.problem.unknowns.camera.keys() - network.idle_cameras
-    kinds = [_lens_terms, _drift, _wrong_interior_orientation]
-    if not any(each.name.endswith(OTHERS) for each in network.cameras):
-        kinds.append(_interior_orientations)
-    of_cameras = (kind(run, camera) for kind in kinds for camera in network.cameras if camera.name in used)
-    yield from chain(*of_cameras, _scanner_pixels(run))
 
 
 # Of the six terms of degree 2 two are decentering, and the tilts of the images take two.
@@ -318,12 +347,6 @@ def _scanner_pixels(run: Run) -> Iterator[ModelHypothesis]:
     yield ModelHypothesis("pixels", words, problem, problem.unknowns.scanner[scanner.name])
 
 
-def image_jumps(run: Run) -> Iterator[ModelHypothesis]:
-    """Displacements of the marks beyond a row or column of digital images."""
-    used = run.problem.unknowns.camera.keys() - run.problem.network.idle_cameras
-    yield from chain(*(_jumps(run, camera) for camera in run.problem.network.cameras if camera.name in used))
-
-
 def _jumps(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     """A displacement of all marks beyond a row or column of one digital image, or of all: a jump of the scanner."""
     rows = run.problem.targets_by_camera[camera.name]
@@ -465,3 +488,229 @@ def _group_words(who: str, found: Estimate) -> tuple[str, str]:
         f"{causes[0].upper()}{causes[1:]}",
         "Give these images a camera of their own (column camera of images.csv), or a folder and project of their own.",
     )
+
+
+def _deformations(run: Run) -> Iterator[ModelHypothesis]:
+    """A strain of the object of all given points; a bend or a twist of a flat one, or another diameter of its disks."""
+    network = run.problem.network
+    if not _is_given(network):
+        return
+
+    form = _flat_form(network)
+    axes = np.eye(3) if form is None else form.axes
+    strain = strain_directions(np.array(list(network.known_places.values())), axes)
+    rows: list[tuple[str, Words, Array]] = [("strain", lambda found: _strain_words(len(axes), found), strain)]
+    if form is not None:
+        is_bent = any(board.by_observation is None for board in network.boards)
+        bends = [form.twist_directions] if is_bent else [form.bend_directions, form.twist_directions]
+        rows += [("bend", _bend_words, np.concatenate(bends, axis=1))]
+    for name, words, directions in rows:
+        by_point = dict(zip(network.known_places, directions, strict=True))
+        yield displaced(run, name, "board", words, _of_targets(run, by_point))
+
+
+def _bend_words(found: Estimate) -> tuple[str, str]:
+    """Describe bends along the two axes of a board, where these are not adjusted anyway, and a twist."""
+    (*bends, twist), (*bend_sigmas, twist_sigma) = found.value, found.sigma
+    remedy = "Put it on a flat plate."
+    twisted = f"two opposite corners stand {abs(twist):.3g} ± {twist_sigma:.1g} above its plane, the others below it"
+    if all(abs(v) < CLEAR * s for v, s in zip(bends, bend_sigmas, strict=True)):
+        return f"The board of the given points is twisted: {twisted} ({INDEPENDENT})", remedy
+    (x, y), (x_sigma, y_sigma) = bends, bend_sigmas
+    further = f"; it is twisted, too, {twisted}" if abs(twist) > CLEAR * twist_sigma else ""
+    return (
+        f"The board of the given points is not flat: its middle stands {x:.3g} ± {x_sigma:.1g} off along its first "
+        f"axis and {y:.3g} ± {y_sigma:.1g} along its second{further} ({INDEPENDENT})",
+        f'{remedy} Or let its bend be adjusted: board_bend = "free" under [object] in project.toml.',
+    )
+
+
+def _strain_words(count: int, found: Estimate) -> tuple[str, str]:
+    """Describe stretches and shears of a flat board (count 2) or of an object in space (3)."""
+    value, names = found.value, ("X", "Y", "Z") if count > 2 else ("its first axis", "its second")
+    middle = int(np.argsort([*value[: count - 1], 0.0])[(count - 1) // 2 if count > 2 else 1])
+    # Stretches relative to the axis in the middle.
+    stretches = np.vstack([np.eye(len(value))[: count - 1], np.zeros(len(value))])
+    rows = [
+        (stretches[i] - stretches[middle], 100.0, f"% {{}} along {names[i]} than along {names[middle]}")
+        for i in range(count)
+        if i != middle
+    ]
+    rows += [
+        (row, 1000.0, f"mrad off in the angle of {names[i]} and {names[j]}")
+        for row, (i, j) in zip(np.eye(len(value))[count - 1 :], combinations(range(count), 2), strict=True)
+    ]
+    changes = [(float(row @ value), np.sqrt(row @ found.covariance @ row), unit, what) for row, unit, what in rows]
+    significant = [each for each in changes if abs(each[0]) > CLEAR * each[1]] or changes
+    figures = " and ".join(
+        f"{abs(unit * v):.3g} ± {unit * s:.1g} {what.format('longer' if v > 0.0 else 'shorter')}"
+        for v, s, unit, what in significant
+    )
+    what = "board" if count == 2 else "object"
+    return (
+        f"The {what} of the given points has another shape than given: it is {figures}",
+        f"Measure the {what} and give the coordinates that it has: printers stretch paper in one direction.",
+    )
+
+
+def _is_given(network: Network) -> bool:
+    """Whether all points of an object are given, and enough to test its shape."""
+    return len(network.known_places) >= max(FEWEST_GIVEN, len(network.observed_points))
+
+
+def _flat_form(network: Network) -> BoardForm | None:
+    try:
+        return board_form(np.array(list(network.known_places.values())))
+    except ValueError:
+        return None
+
+
+def _of_targets(run: Run, by_point: Mapping[str, Array]) -> Array:
+    """(n, k, 3) displacements of the points of all targets, of those (k, 3) by name; 0 for others."""
+    none = np.zeros_like(next(iter(by_point.values())))
+    return np.array([by_point.get(name, none) for name in run.problem.network.observations.point])
+
+
+def _possible_radius(run: Run) -> float:
+    """Radius of disks: as given, or where it is not a quarter of the distance of neighbours."""
+    network = run.problem.network
+    if network.disk_radius is not None:
+        return network.disk_radius
+    xyz = np.array(list(network.known_places.values()))
+    nearest, _ = KDTree(xyz).query(xyz, 2)
+    return float(np.median(np.asarray(nearest)[:, 1])) / 4.0
+
+
+def _disks(run: Run) -> Iterator[ModelHypothesis]:
+    """Another squared radius of disks on a board than given, or one where nothing says that the points are disks."""
+    problem, state, network = run.problem, run.end.state, run.problem.network
+    given = network.disk_radius
+    form = _flat_form(network) if _is_given(network) and given != 0.0 else None
+    if form is None:
+        return
+    radius, at = _possible_radius(run), dict[tuple[int, int], Array]()
+    points = np.array([at for id_, at in problem.unknowns.point.items() if id_ in network.known_places])
+    shown = network.observations.has_kind("target")
+    for i, j in product((-1, 0, 1), repeat=2):
+        values = state.values.copy()
+        values[points] += radius * (np.array([i, j]) @ form.axes)
+        if (computed := computed_observations(problem, State(values, state.rotations))) is None:
+            return
+        at[i, j] = computed[shown]
+
+    def words(found: Estimate) -> tuple[str, str]:
+        sigma, diameter = found.sigma[0], 2.0 * np.sqrt(max((given or 0.0) ** 2 + found.value[0], 0.0))
+        figures = f"{diameter:.3g} ± {2.0 * sigma / max(diameter, np.sqrt(sigma)):.1g} (points' unit)"
+        if given is None:
+            return (
+                "The points are centres of dots, whose perspective is not corrected: their diameter is found as "
+                f"{figures}",
+                'Give their diameter_mm under [targets], kind = "disk".',
+            )
+        return (
+            f"The disks do not have the diameter of {2.0 * given:.4g} that is given, or the points another spacing: by "
+            f"the coordinates it is found as {figures}",
+            "Measure a disk, and from one to the next; correct diameter_mm or the coordinates and their unit.",
+        )
+
+    directions = np.zeros((len(shown), 1, 3))
+    directions[shown] = disk_directions(at, form.axes, radius)
+    limits = (-np.inf, np.inf) if given is not None else (0.0, (2.0 * radius) ** 2)
+    yield replace(displaced(run, "disks", "disks", words, directions), limits=limits)
+
+
+def diameter_notes(run: Run) -> Iterator[str]:
+    """Note where a wrong diameter of the disks, or one that is not given, changes c by more than its deviation."""
+    for each in _disks(run) if run.converged else ():
+        unknowns, (radius_squared,) = each.problem.unknowns, each.added
+        if (at := run.linearised(each.problem)) is None:
+            return
+        cofactor = free_cofactor(at)
+        given = run.problem.network.disk_radius
+        for camera, (c, *_) in unknowns.camera.items():
+            (own, common), (_, square) = cofactor.part(np.array([c, radius_squared]))
+            squared = _possible_radius(run) ** 2 if given is None else ((1.0 + MISMEASURED) ** 2 - 1.0) * given**2
+            change = squared * common / square
+            if abs(change) <= np.sqrt(own - common**2 / square):
+                continue
+            if given is not None:
+                yield (
+                    f"The diameter of the disks is taken as exact: if it is {100.0 * MISMEASURED:.0f} % larger, c of "
+                    f"camera {camera} changes by {change:+.2g} mm."
+                )
+            elif squared - at.factor.solution[at.rows.numbering.numbers[radius_squared]] < CLEAR * np.sqrt(square):
+                yield (
+                    "Nothing says whether the points are corners or the centres of dots: if they are dots of a "
+                    f"diameter of {2.0 * np.sqrt(squared):.2g} (points' unit), whose perspective is not corrected, c "
+                    f"of camera {camera} changes by {change:+.2g} mm. Give their diameter_mm under [targets], kind = "
+                    '"disk".'
+                )
+
+
+def _wrong_points(run: Run, most: int) -> Iterator[ModelHypothesis]:
+    """Wrong coordinates of fixed points, heights alone, say, or of a line or a side of a regular field by one shift.
+
+    Coordinates that are given with a standard deviation are observations, tested by data snooping.
+    """
+    network, unknowns = run.problem.network, run.problem.unknowns
+    images = Counter(name for name, _ in set(zip(network.observations.point, network.observations.image, strict=True)))
+    fixed = {
+        name: np.array([prior is not None and prior.sigma == 0.0 for prior in network.point_by_id[name].priors])
+        for name in unknowns.point
+        if images[name] >= FEWEST_IMAGES
+    }
+    fixed = {name: mask for name, mask in fixed.items() if mask.any()}
+    if len(fixed) < FEWEST_GIVEN:
+        return
+    positions = np.concatenate([unknowns.point[name][mask] for name, mask in fixed.items()])
+    form = _flat_form(network) if network.known_places else None
+    axes = np.eye(3) if form is None else form.axes
+    for selection in displaced_points(run, axes, continued_with(run, positions), fixed, most):
+        mask = np.array([fixed[name] for name in selection.names])
+        added = np.array([unknowns.point[name] for name in selection.names])[mask]
+        words = _point_words(selection, mask, unknowns.given[added])
+        if selection.words:
+            moved = _of_targets(run, dict.fromkeys(selection.names, np.eye(3)))
+            found = displaced(run, "group", "point", words, moved)
+        else:
+            found = ModelHypothesis("point", words, continued_with(run, added), added)
+        yield replace(found, selection=selection)
+
+
+def _point_words(selection: Selection, fixed: Mask, given: Array) -> Words:
+    """Words on points whose fixed coordinates (k, 3) are not those given (n,), or on a group with one shift."""
+    names, remedy = selection.names, "Correct the coordinates of these points, or their numbers among the marks."
+
+    def words(found: Estimate) -> tuple[str, str]:
+        offs, sigmas = np.zeros((2, *fixed.shape))
+        if selection.words:
+            offs, sigmas = -found.value[None], found.sigma[None]
+        else:
+            offs[fixed], sigmas[fixed] = given - found.value, found.sigma
+        by = [_shift_words(*each) for each in zip(offs, sigmas, strict=True)]
+        some = shortened(names, MOST_NAMED)
+        if selection.words:
+            return (
+                f"The points {some} ({selection.words}) are not where they are given: all their coordinates are off, "
+                f"{by[0]} (points' unit)",
+                remedy,
+            )
+        if len(names) == 1:
+            return (
+                f"Point {names[0]} is not where it is given: its coordinates are off, {by[0]} (points' unit)",
+                "Correct the coordinates of this point, or its number among the marks.",
+            )
+        worst = np.argsort(-np.linalg.norm(offs, axis=1), kind="stable")[:NAMED]
+        return (
+            f"{len(names)} points are not where they are given: {some}; the coordinates of the worst are off, "
+            f"{'; '.join(f'{names[k]}: {by[k]}' for k in worst)} (points' unit)",
+            remedy,
+        )
+
+    return words
+
+
+def _shift_words(off: Array, sigma: Array) -> str:
+    digits = [max(0, -int(np.floor(np.log10(max(s, 1e-12))))) for s in sigma]
+    rows = zip("XYZ", off, sigma, digits, strict=True)
+    return ", ".join(f"{axis} by {d:+.{n}f} ± {s:.1g}" for axis, d, s, n in rows if s > 0.0)

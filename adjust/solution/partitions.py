@@ -25,8 +25,7 @@ from adjust.quality.run import Run, derivatives_by
 FLAT = 1e-9  # fraction of the largest eigenvalue below which a direction is undetermined
 MOST_TURNS = 20  # iterations of two-means
 DRAWS = 4000  # simulated sets of images
-BINS = 10  # parts of the images at whose borders jumps are sought
-MOST_CUTS = 40  # jumps tried between two borders
+BINS = 100  # parts of the images at whose borders jumps are sought
 FEWEST, MOST = 5, 400  # given points: so many tell a wrong one; N is dense
 MOST_WRONG = 1 / 3  # fraction of the points
 SAME_LINE = 1e-3  # fraction of the field's extent by which the points of a line lie off it
@@ -191,28 +190,12 @@ def jumps(run: Run, rows: Indices) -> Iterator[Jump]:
             cuts = np.quantile(along, np.linspace(0.0, 1.0, BINS + 1)[1:-1])
             falls = _jump_falls(run, rows, of_image, along, cuts)
             image, at = (int(k) for k in np.unravel_index(np.argmax(falls), falls.shape))
-            members, ends = of_image == image, np.array([-np.inf, *cuts, np.inf])[[at, at + 2]]
-            found.append((*_exact_cut(run, rows[members], along[members], ends), axis, image))
+            found.append((float(falls[image, at]), float(cuts[at]), axis, image))
         _, cut_mm, axis, image = max(found)
         beyond = np.zeros(len(places), dtype=bool)
         beyond[rows] = (of_image == image) & (places[rows, axis] > cut_mm)
         name = problem.network.images[images[image]].name if of_image is own else ""
         yield Jump(name, axis, cut_mm, beyond, float(np.log(2.0 * len(rows))))
-
-
-def _exact_cut(run: Run, rows: Indices, along: Array, ends: Array) -> tuple[float, float]:
-    """Best decrease of v'Pv, and its cut, of those that part the targets of an image between two ends otherwise."""
-    while True:
-        near = np.unique(along[(along > ends[0]) & (along < ends[1])])
-        between = (near[1:] + near[:-1]) / 2.0 if len(near) > 1 else near
-        cuts = between[:: len(between) // MOST_CUTS + 1]
-        if not len(cuts):
-            return 0.0, 0.0
-        (falls,) = _jump_falls(run, rows, np.zeros_like(rows), along, cuts)
-        at = int(np.argmax(falls))
-        if len(cuts) == len(between):
-            return float(falls[at]), float(cuts[at])
-        ends = np.array([ends[0], *cuts, ends[1]])[[at, at + 2]]
 
 
 def _jump_falls(run: Run, rows: Indices, of_image: Indices, along: Array, cuts: Array) -> Array:

@@ -62,7 +62,7 @@ from adjust.rank_defect.datum import (
 )
 from adjust.rank_defect.diagnosis import held_directions, inseparable
 from adjust.solution.explanations import Explanation, explain
-from adjust.solution.object_hypotheses import diameter_notes
+from adjust.solution.model_hypotheses import diameter_notes
 from adjust.solution.options import Options
 from adjust.solution.reweighting import again, run
 from adjust.solution.warnings import curved_valley_warnings, film_scale_notes, held_decentering_notes, run_warnings

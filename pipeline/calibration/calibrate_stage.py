@@ -16,7 +16,7 @@ from rich.console import Console
 
 from adjust.display import CameraPlots, PlottedResult, data_frame
 from adjust.errors import AdjustmentError
-from adjust.solution.adjustment import PLAUSIBLE, adjust
+from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
 from measure import MeasurementError, open_scan
 from measure.boards.find import recognise_board
@@ -45,10 +45,6 @@ from pipeline.workers import WorkOptions
 GENEROUS = 2.0  # factor on the unmodelled standard deviation, for lens models with larger misfit than the first
 FEWEST_CORNERS = 4  # corners for a space resection with redundancy
 FEWEST_PICTURES = 3  # images of a flat board needed for principal distance and principal point
-MOST_ODD = 1 / 3  # fraction of a camera's images that may be of another camera or board than the others
-WORST = 3  # images with the largest residuals, one of which is left out in turn
-OF_SOME_IMAGES = ("groups", "drift", "distances")  # explanations that images of another camera or board may look like
-CLEARER = 3.0  # factor by which unmodelled errors fall without images that are odd
 
 OUT = Path("calibration")
 LENSES: dict[str, LensSetting] = {"auto": "auto", **{model: model for model in get_args(LensModel)}}
@@ -177,13 +173,6 @@ def _calibrated(
                     project = write_project(out, pictures, options, lenses)
                 _check_count(camera, left_out)
                 adjustment, choice = adjust_marks(project, own), None
-                if odd := _odd_pictures(project, own, camera, adjustment, options.pixel_mm):
-                    left_out |= odd
-                    own = [mark for mark in own if mark.image not in odd]
-                    camera = replace(camera, images=tuple(name for name in camera.images if name not in odd))
-                    pictures = pictures.with_camera(camera)
-                    project = write_project(out, pictures, options, lenses)
-                    adjustment = adjust_marks(project, own)
                 if options.lens == "auto":
                     choice = _chosen_lens(project, adjustment, camera, options)
                     if choice.model != first:
@@ -247,49 +236,6 @@ def _check_count(camera: CameraPictures, left_out: Mapping[str, str]) -> None:
             f"{FEWEST_PICTURES} or more with different tilts are needed{others and f' (others: {others})'}. Pictures "
             "that were cut are taken for another camera's: give them as they were taken."
         )
-
-
-def _odd_pictures(
-    project: Project, marks: Sequence[ComparatorPoint], camera: CameraPictures, adjustment: Adjustment, pixel_mm: float
-) -> dict[str, str]:
-    """Images that no camera and board fits together with the others, with the reason.
-
-    Sought where unmodelled errors are implausibly large, or seem to be of some images. That image is left out without
-    which the errors are smallest, and so on until they are CLEARER times smaller.
-    """
-    first = adjustment.unmodelled_mm[camera.name]
-    plausible = PLAUSIBLE * pixel_mm * float(np.hypot(camera.width_px, camera.height_px))
-    if first <= plausible and not any(each.kind in OF_SOME_IMAGES for each in adjustment.explanations):
-        return {}
-    odd, last, enough = list[str](), adjustment, min(plausible, first / CLEARER)
-    while last.unmodelled_mm[camera.name] > enough and len(odd) + 1 <= MOST_ODD * len(camera.images):
-        trials = dict[str, Adjustment]()
-        for name in _worst_images(last):
-            rest = [mark for mark in marks if mark.image not in (*odd, name)]
-            with suppress(AdjustmentError, InputError):
-                trials[name] = adjust_marks(project, rest)
-        if not trials:
-            return {}
-        worst = min(trials, key=lambda name: trials[name].unmodelled_mm[camera.name])
-        odd.append(worst)
-        last = trials[worst]
-    left = last.unmodelled_mm[camera.name]
-    if left > enough:
-        return {}
-    why = (
-        f"it contradicts the others: without {'it' if len(odd) == 1 else 'such pictures'} the errors that are not "
-        f"modelled fall from {first / pixel_mm:.2g} to {left / pixel_mm:.2g} px. It may be of another camera or zoom, "
-        "cropped or scaled, or show another print of the board: calibrate such pictures by themselves"
-    )
-    return dict.fromkeys(odd, why)
-
-
-def _worst_images(adjustment: Adjustment) -> list[str]:
-    """The WORST images with the largest rms residuals."""
-    network = adjustment.network
-    squares = np.bincount(network.image_numbers, (adjustment.residuals.v_mm**2).sum(axis=1), len(network.images))
-    order = np.argsort(-squares / np.maximum(np.bincount(network.image_numbers, minlength=len(network.images)), 1))
-    return [network.images[number].name for number in order[:WORST]]
 
 
 def _chosen_lens(

@@ -240,7 +240,7 @@ def test_images_with_which_the_iteration_does_not_converge_are_left_out() -> Non
     result = adjust(make_network({**images, **wrong}, rng))
     assert result.converged
     assert sorted(result.left_out) == ["good2", "good5"]
-    assert {why.split(" the ")[0] for why in result.left_out.values()} == {"with image good2", "with image good5"}
+    assert {reason.split(" the ")[0] for reason in result.left_out.values()} == {"with images good2, good5"}
     assert abs(result.value("IO.cam.c") - C) < 4.0 * result.sigma("IO.cam.c")
     assert result.redundancy == adjust(make_network(images, rng)).redundancy - 2 * (2 * 54 - 6)
 

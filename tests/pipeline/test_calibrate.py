@@ -413,7 +413,7 @@ def test_a_picture_of_another_print_is_named_and_no_other(odd: tuple[str, ...], 
         for point, place in zip(BOARD.object_points(), places + rng.normal(0.0, 0.02, places.shape), strict=True):
             xy_mm, sigma_mm = place * [options.pixel_mm, -options.pixel_mm], np.full(2, 0.02 * options.pixel_mm)
             marks.append(ComparatorPoint(image, point, "target", xy_mm, sigma_mm, 0.0, Status.MEASURED, ""))
-    found = calibrate_stage._odd_pictures(project, marks, camera, adjust_marks(project, marks), options.pixel_mm)
+    found = adjust_marks(project, marks).left_out
     assert tuple(found) == odd
     assert all("another print of the board" in why for why in found.values())
 
