@@ -296,10 +296,12 @@ def _drift(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     middle = np.stack([np.bincount(of_row, points[:, k]) for k in range(3)], axis=1) / counts[:, None]
     nearness = 1.0 / np.linalg.norm(middle - state.values[problem.exterior[shown, :3]], axis=1)
 
+    distance = state.values[problem.unknowns.camera[camera.name][0]] / 100.0
+
     def words(along: str) -> Words:
         return lambda found: (
-            f"The principal distance of camera {camera.name} changes {along}, by {found.value[0]:+.3g} ± "
-            f"{found.sigma[0]:.1g} mm: the focus drifts",
+            f"The principal distance of camera {camera.name} changes {along}, by {found.value[0] / distance:+.3g} ± "
+            f"{found.sigma[0] / distance:.1g} %: the focus drifts",
             REFOCUSED,
         )
 
@@ -437,32 +439,37 @@ def _apart(run: Run, camera: Camera, others: Mapping[str, str], count: int) -> t
 
 def _distance_words(camera: str, images: Sequence[str], found: Estimate) -> tuple[str, str]:
     """Describe principal distances of the images by the shortest and the longest."""
-    ends = np.argsort(found.value)[[0, -1]]
-    shortest, longest = (f"{found.value[k]:.5g} ± {found.sigma[k]:.1g} mm in {images[k]}" for k in ends)
+    first, last = np.argsort(found.value)[[0, -1]]
+    shortest = found.value[first]
+    longer, sigma = found.value[last] / shortest - 1.0, np.hypot(*found.sigma[[first, last]]) / shortest
     return (
-        f"The principal distance of camera {camera} differs from image to image, from {shortest} to {longest}: focus "
-        "or zoom changed",
+        f"The principal distance of camera {camera} differs from image to image, by {100.0 * longer:.3g} ± "
+        f"{100.0 * sigma:.1g} % between {images[first]} and {images[last]}: focus or zoom changed",
         REFOCUSED,
     )
 
 
 def _group_words(who: str, found: Estimate) -> tuple[str, str]:
-    """Describe two groups of images by the simplest differences of interior orientation that fit."""
+    """Describe two groups of images by the simplest differences of interior orientation that fit.
+
+    They are given in fractions of c: the pixels of digital cameras may have no size.
+    """
     base, difference = found.value[3:], found.value[:3] - found.value[3:]
     by_both = np.hstack([np.eye(3), -np.eye(3)])
     spread = by_both @ found.covariance @ by_both.T
     sigma, weight = np.sqrt(np.diag(spread)), np.linalg.pinv(spread, hermitian=True)
     scale = 1.0 + float(difference @ base) / float(base @ base)
+    (c, x0, y0), (c_sigma, x0_sigma, y0_sigma) = 100.0 * difference / base[0], 100.0 * sigma / base[0]
     readings = (
         (
             np.eye(3)[:, :1],
-            f"{who} have another principal distance than the others, by {difference[0]:+.4g} ± {sigma[0]:.1g} mm "
+            f"{who} have another principal distance than the others, by {c:+.3g} ± {c_sigma:.1g} % "
             "(zoom or focus changed)",
         ),
         (
             np.eye(3)[:, 1:],
-            f"{who} have another principal point than the others, by ({difference[1]:+.4g}, {difference[2]:+.4g}) ± "
-            f"({sigma[1]:.1g}, {sigma[2]:.1g}) mm: images of different sizes in one camera (cropped), or turned or "
+            f"{who} have another principal point than the others, by ({x0:+.3g}, {y0:+.3g}) ± "
+            f"({x0_sigma:.1g}, {y0_sigma:.1g}) % of c: images of different sizes in one camera (cropped), or turned or "
             "mirrored pictures",
         ),
         (
@@ -471,8 +478,8 @@ def _group_words(who: str, found: Estimate) -> tuple[str, str]:
         ),
         (
             np.eye(3),
-            f"{who} have another interior orientation than the others: c is {1.0 + difference[0] / base[0]:.4g} times "
-            f"as long, the principal point ({difference[1]:+.4g}, {difference[2]:+.4g}) mm off (another camera, or "
+            f"{who} have another interior orientation than the others: c is {1.0 + c / 100.0:.4g} times "
+            f"as long, the principal point ({x0:+.3g}, {y0:+.3g}) % of c off (another camera, or "
             "pictures cropped and enlarged)",
         ),
     )
