@@ -82,7 +82,12 @@ def find_pictures(given: Sequence[Path], out: Path) -> BoardPictureFiles:
     names = names_below(paths)
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise InputError(f"two pictures are called {twice[0]!r} without their endings. Move one of them away.")
+        alike = " and ".join(str(path) for name, path in zip(names, paths, strict=True) if name == twice[0])
+        more = f", and so are {len(twice) - 1} others" if len(twice) > 1 else ""
+        raise InputError(
+            f"{alike} are called {twice[0]!r}{more}: names have no ending. Give files of one kind "
+            "in place of the folder, as *.png."
+        )
     groups, unreadable = defaultdict[_Kind, list[str]](list), dict[str, str]()
     turns = dict[str, int | None]()
     for name, path in zip(names, paths, strict=True):

@@ -299,6 +299,10 @@ def test_pictures_are_sorted_by_size_and_focal_length_and_results_are_no_picture
     assert {camera.name: camera.images for camera in cameras} == {"camera-40x30": ("a", "b"), "camera-20x30": ("c",)}
     with pytest.raises(InputError, match="there is no picture"):
         find_pictures([tmp_path / "out"], tmp_path / "out")
+    for ending in ("jpg", "tif"):
+        save_picture(tmp_path / f"a.{ending}", (40, 30))
+    with pytest.raises(InputError, match=r"a\.jpg and .*a\.png and .*a\.tif are called 'a'"):
+        find_pictures([tmp_path], tmp_path / "out")
     for name, focal_mm in (("a", 24.0), ("b", 50.0)):
         save_picture(tmp_path / "focal" / f"{name}.jpg", (40, 30), focal_mm=focal_mm)
     cameras = find_pictures([tmp_path / "focal"], tmp_path / "out").cameras
