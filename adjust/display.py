@@ -25,6 +25,7 @@ BAND = 1.959964  # in standard deviations, half width of the 95 % band
 LONGEST = 0.08  # length of the longest vectors, fraction of the longer side of the image
 CELLS = 8  # cells of the coverage along the longer side
 FEWEST_LEVELS = 5
+CORNER = 0.05  # of the longer side: nearer to a corner than this the labels of contours overlap
 ROUND = (1.0, 2.0, 5.0)  # mantissas of round numbers
 FINER = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 TARGET, FIDUCIAL, OUTLINE = "#1f5fa8", "#c2571a", "#777777"
@@ -78,8 +79,8 @@ class CameraPlots:
         axes.quiverkey(quiver, 0.95, -0.1, key, f"{key:g} {self._short_unit}", labelpos="W")
         if self.is_fiducial.any():
             axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.11), ncols=2, frameon=False, fontsize="small")
-        rms = np.sqrt((sizes**2).mean())
-        axes.set_title(f"{self.name}: residuals, rms {rms:.3g} {self._short_unit} a point", loc="left", fontsize=10)
+        rms = " × ".join(f"{axis:.3g}" for axis in np.sqrt((vectors**2).mean(axis=0)))
+        axes.set_title(f"{self.name}: residuals, rms {rms} {self._short_unit}", loc="left", fontsize=10)
         return axes
 
     def plot_distortion(self, axes: "Axes | None" = None) -> "Axes":
@@ -138,7 +139,10 @@ class CameraPlots:
             extend="both",
         )
         lines = axes.contour(places[..., 0], places[..., 1], sigma, levels=levels, colors="black", linewidths=0.6)
-        axes.clabel(lines, fmt="%g", fontsize=8)
+        low, high = np.sort(self._places(self.corners_mm), axis=0)
+        for label in axes.clabel(lines, fmt="%g", fontsize=8):
+            inward = np.minimum(label.get_position() - low, high - label.get_position())
+            label.set_visible(bool(inward.max() > CORNER * (high - low).max()))
         colours = axes.figure.colorbar(filled, ax=axes, format="%g", shrink=0.8)
         colours.set_label(f"standard deviation ({self._short_unit})")
         where = "at infinity" if np.isinf(distance) else f"at a distance of {distance_text(distance)}"
@@ -164,7 +168,8 @@ class CameraPlots:
         shown = axes.pcolormesh(*edges, np.ma.masked_equal(number.T, 0), cmap="Blues", vmin=0, alpha=0.8)
         axes.figure.colorbar(shown, ax=axes, shrink=0.8, label="targets in a cell")
         axes.plot(*places.T, ".", color="black", markersize=1.5)
-        title = f"{self.name}: {len(places)} targets in {self.images} images, {(number > 0).mean():.0%} of the cells"
+        share = 100 * (number > 0).mean()
+        title = f"{self.name}: {len(places)} targets in {self.images} images, {share:.0f} % of the cells"
         axes.set_title(title, loc="left", fontsize=10)
         return axes
 

@@ -174,7 +174,8 @@ def _frame_table(summary: Summary) -> Table:
     """Table of marks and residuals by frame, the worst first, without empty columns."""
     frames, poses, rms = summary.frames, summary.poses, _rms_um(summary.adjustment)
     lost = {name: sum(counts.values()) - counts[Status.MEASURED] for name, counts in frames.items()}
-    worst = sorted(frames, key=lambda name: (rms.get(name, 0.0), lost[name]), reverse=True)
+    is_lost = {name: not (counts[Status.MEASURED] or counts[Status.WEAK]) for name, counts in frames.items()}
+    worst = sorted(frames, key=lambda name: (is_lost[name], rms.get(name, 0.0), lost[name]), reverse=True)
     statuses = [status for status in Status if any(counts[status] for counts in frames.values())]
     title = "Frames, the worst first" + (f" ({FRAME_ROWS} of {len(worst)})" if len(worst) > FRAME_ROWS else "")
     unit = summary.unit.short_name

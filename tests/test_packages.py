@@ -173,7 +173,7 @@ AVOIDED = {  # a pattern, and what to write
     r"(?<![-\w.])um(?![-\w.])": "µm",
     r"\b(?:IO|FID|SC|BD|PT|EO|JOIN)\.": "a quantity in words: x of fiducial 3, camera Wild RC8",
     r"\btold\b": "known, identified, estimable",
-    r"\bseen\b|\bsight(?:ing|er)s?\b": "found, visible, measured, detection",
+    r"\bseen\b|\b[Ss]ight(?:ing|er)?s?\b": "found, visible, measured, detection",
     r"\bchance\b": "false alarm, expected number of false alarms, p-value",
     r"\bwith a probability of\b": "p = 0.003",
     r"\blooks? (?:like|alike|plainly)\b|\blook(?:ed|ing) (?:again|at)\b|\bcloser look\b": "matches, second pass",
@@ -182,9 +182,9 @@ AVOIDED = {  # a pattern, and what to write
     r"\bunlike\b|\bown turn\b|\blandscape\b|\bborders? of the ground\b": "model misfit, background texture",
     r"\b(?:the|its|their|The|Its|Their) ground\b": "background (of a mark), terrain (of an image)",
     r"\bpower of\b(?! the test)|\bunround\b": "gamma, quantisation",
-    r"\b(?:takes?|taken|took) up\b": "film deformation model, correlated with",
+    r"\b(?:takes?|taken|took) (?:it |them )?up\b": "film deformation model, correlated with",
     r"\bjudg\w+|\bwitness\w*\b|\basked\b": "cross-scan checks",
-    r"\bstores?\b": "results database, server",
+    r"\b[Ss]tores?\b": "results database, server",
     r"\bbeside\b": "next to, after, from, in addition to",
     r"\bcounts? as known\b": "standard deviation set to",
     r"\bundetermined\b|\btrades? off\b": "rank defect, correlated",
@@ -197,7 +197,6 @@ AVOIDED = {  # a pattern, and what to write
     r"\bspeaks?\b|\banew\b|\bmute\b|\bnobody said\b": "is evidence for, again, does not say",
 }
 ALLOWED_WORDS = (  # names in files, which the contract keeps
-    r"# pitch of .*",
     r"^(?:unlike drawing|own turn)$",
 )
 SQL = re.compile(r"\b(?:select|insert into|update|delete from|create|alter table|where|pragma|row_digest|judging)\b")

@@ -236,8 +236,8 @@ def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
         return (
             f"The pictures of {who} are bowed: half the frame off the middle, columns lie {x_um:+.3g} ± "
             f"{sigma_um[0]:.1g} µm aside and rows {y_um:+.3g} ± {sigma_um[1]:.1g} µm",
-            "Look for a rolling shutter, stabilisation or a scanner's lens. A distortion family with such terms takes "
-            "it up, legendre(3) say.",
+            "Look for a rolling shutter, stabilisation or a scanner's lens. Use a distortion family with such "
+            "terms, for example legendre(3).",
         )
 
     def sheared(found: Estimate) -> tuple[str, str]:

@@ -12,11 +12,13 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from adjust.functional_model.families import family as family_of
 from adjust.functional_model.lens import Lens
 from adjust.problem.parameter import Parameter
 from adjust.quality.lens_comparison import CameraCalibration, Comparison, Test, Use, compare, sigmas
 from pipeline.drawing import svg
 from pipeline.errors import InputError
+from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.results.adjustment_file import observed_mm, read_adjustment, read_own_covariance
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.record_json import write_record
@@ -171,13 +173,16 @@ def _print_difference(
     comparison: Comparison, k: int, parameters: Sequence[ParameterDifference], console: Console
 ) -> None:
     first, *others = (each.name for each in comparison.calibrations)
-    columns = ("parameter", first, others[k], "difference", "in joint sigmas")
+    columns = ("parameter", first, others[k], "difference", "sigma", "in joint sigmas", "unit")
+    family = family_of(comparison.calibrations[0].lens.distortion.family)
     table = Table(*columns, title=f"{others[k]} less {first}", title_justify="left")
     for row in parameters:
         if np.isnan(row.sigmas) and row.difference == 0.0:
             continue
-        size = "both fixed" if np.isnan(row.sigmas) else f"{row.sigmas:+.1f}"
-        table.add_row(row.name, f"{row.first:.7g}", f"{row.other:.7g}", f"{row.difference:+.3g}", size)
+        size = "both fixed" if np.isnan(row.sigmas) else fixed(row.sigmas, 1, sign=True)
+        values = [value_and_sigma(each, row.sigma, abs(row.first))[0] for each in (row.first, row.other)]
+        unit = "mm" if row.name in ("c", "x0", "y0") else family.unit(row.name)
+        table.add_row(row.name, *values, *value_and_sigma(row.difference, row.sigma), size, unit)
     console.print(table)
     field = comparison.field_um[k]
     x, y = comparison.places_mm[np.hypot(*field.T).argmax()]
@@ -233,13 +238,18 @@ def _panel(title: str, field_um: Array, covariance_um2: Array, starts: Array, px
     um = svg.round_step(_LONGEST * (right - left) / px_per_um)
     return (
         svg.words(left, 24.0, title, "label"),
-        svg.words(left, 42.0, f"longest arrow {_longest(field_um):.2f} µm", "tick"),
+        svg.words(left, 42.0, f"longest arrow {_longest(field_um):.2f} µm{_within(field_um, radii_um)}", "tick"),
         svg.tag("rect", x=left, y=top, width=right - left, height=bottom - top, class_="frame"),
         *svg.ellipses(ends, px_per_um * radii_um, angles),
         svg.strokes(starts, ends, "vector target"),
         svg.strokes(starts, starts, "dot target"),
         svg.scale_bar(left, bottom + 16.0, um * px_per_um, f"{um:g} µm, ellipses of 95 %"),
     )
+
+
+def _within(field_um: Array, radii_um: Array) -> str:
+    """Remark where each arrow is shorter than the smaller axis of its ellipse."""
+    return "; no arrow is longer than its ellipse" if (np.hypot(*field_um.T) < radii_um.min(axis=1)).all() else ""
 
 
 def _longest(field_um: Array) -> float:

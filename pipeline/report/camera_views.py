@@ -15,7 +15,7 @@ from pipeline.report import fiducials, lens, vectors
 from pipeline.report.data import ReportData
 from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.numbers import fixed, significant
-from pipeline.report.parameters import camera_values, high_correlations, parameter_rows, term_rows
+from pipeline.report.parameters import camera_values, parameter_rows, term_rows
 from pipeline.report.vectors import contour_plot, coverage_plot, grid_mm, longest_vector, padded_plane, strokes_and_dots
 from pipeline.results.adjustment_file import Covariance
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, ScannerRecord
@@ -66,7 +66,6 @@ def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraR
         effect_where="in the frame" if is_defined_over_frame(camera.lens()) else f"at {radius} {unit.long_name}",
         # For a digital camera the values above already state c, x0' and y0' in px.
         parameters=(parameters[3:] if unit.is_pixel else parameters) if is_calibrated else [],
-        correlations=high_correlations(name, camera, covariance) if covariance else [],
         correlation_causes=_correlation_causes(name, stored),
         lens=_lens_view(name, camera, covariance, on, radius_mm, unit) if covariance else None,
         vectors=vectors.all_images_plot(some, on, field.scale(LONGEST_VECTOR_PX))
@@ -104,7 +103,7 @@ def _correlation_causes(name: str, stored: AdjustmentRecord) -> list[str]:
     """Causes and remedies of high correlations of a camera's quantities, in words."""
     firsts = (parameter_from_text(each.parameters[0]) for each in stored.correlations)
     return [
-        f"{each.cause} {each.remedy}"
+        f"{each.cause.replace(' -', ' −')} {each.remedy}"
         for each, first in zip(stored.correlations, firsts, strict=True)
         if first.kind == "interior" and first.owner == name
     ]

@@ -16,6 +16,7 @@ from pipeline.text.wording import listed
 from pipeline.types import Array
 
 LONGEST_PX = 46.0
+VISIBLE_PX = 1.5  # smallest half axis of an ellipse that can be told from its centre
 WIDTH_PX = 400.0
 SIGNIFICANT = 3.0  # standard deviations of a coordinate
 DATUM_UM = 100.0  # µm; coordinates with a larger given standard deviation only define the datum
@@ -183,6 +184,8 @@ def figure_plot(change: Figure) -> Markup:
     corners = page(np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]]))
     um = svg.round_step(70.0 / px_per_um)
     size = f"{um:g} µm, enlarged {1e3 * px_per_um / px_per_mm:,.0f} times"
+    if px_per_um * radius.max() < VISIBLE_PX:
+        size += "; the ellipses are too small to show"
     content = [
         svg.line(corners[:, 0], corners[:, 1], "frame", closed=True),
         *svg.ellipses(ends, px_per_um * radius, angles),

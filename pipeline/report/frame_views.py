@@ -1,6 +1,7 @@
 """Frames in the report: a line of the summary, marks with their pictures, residuals, orientation and writing."""
 
 import base64
+import math
 from collections import defaultdict
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
@@ -38,7 +39,7 @@ LARGE_W = 3.0  # standardised residual above which a mark needs a look
 MOST_CARDS = 60  # largest number of marks that need a look
 PLOT_PX = 330.0
 LONGEST_VECTOR_PX = 42.0
-_LEAST_PART_PX = 0.0005  # px, half of the last digit printed
+_LEAST_PART = 0.1  # share of the variance above which a cause is listed
 
 
 def shown_marks(shots: list[Frame]) -> dict[str, list[Mark]]:
@@ -199,7 +200,7 @@ class FrameView:
     def badness(self) -> tuple[bool, float, int]:
         """Sort key, larger is worse: no mark observed, then residuals, then number of open marks."""
         is_lost = not any(mark.status.is_observation for mark in self.frame.marks)
-        return is_lost, sum(self.rms or (0.0,)), sum(mark.needs_review for mark in self.frame.marks)
+        return is_lost, math.hypot(*(self.rms or (0.0,))), sum(mark.needs_review for mark in self.frame.marks)
 
 
 def frame_views(data: ReportData, shots: list[Frame], every_mark: bool = False) -> list[FrameView]:
@@ -266,7 +267,8 @@ def _plots(
 
 def _causes(covariance: Covariance | None) -> tuple[tuple[str, str, str], ...]:
     sigmas = {} if covariance is None else covariance.sigmas_px
-    parts = [(cause, sigma) for cause, sigma in sigmas.items() if sigma >= _LEAST_PART_PX]
+    least = _LEAST_PART * sum(sigma**2 for sigma in sigmas.values())
+    parts = [(cause, sigma) for cause, sigma in sigmas.items() if sigma**2 >= least]
     named = tuple((cause.shown, fixed(sigma, 3), cause.meaning) for cause, sigma in parts)
     return named if len(named) > 1 else ()
 

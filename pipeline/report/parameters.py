@@ -32,7 +32,6 @@ SYMBOLS = {"x0": "x₀′", "y0": "y₀′"}
 LARGER = 1.5  # ratio of standard deviations that a dozen images rarely exceed by chance
 
 MOSTLY_PRIOR = 0.9  # fraction of the prior sigma above which the observations have contributed little
-HIGH_CORRELATION = 0.9
 
 
 @dataclass(frozen=True)
@@ -151,21 +150,6 @@ def _scaled(known: Quantity, factor: float) -> Quantity:
     """Convert a quantity to another unit."""
     given = known.given and GivenQuantity(factor * known.given.value, factor * known.given.sigma)
     return replace(known, value=factor * known.value, sigma=factor * known.sigma, given=given)
-
-
-def high_correlations(name: str, camera: CameraRecord, covariance: Covariance) -> list[tuple[str, str, float]]:
-    """Pairs of highly correlated parameters, the highest correlation first."""
-    parameters = ["c", "x0", "y0", *parameter_names(camera.distortion.family)]
-    block = covariance.select(Parameter.interior(name, parameter) for parameter in parameters)
-    sigma = np.sqrt(np.maximum(np.diag(block), 0.0))
-    free = np.flatnonzero(sigma > 0.0)
-    correlation = block[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
-    pairs = [
-        (parameters[free[i]], parameters[free[j]], float(correlation[i, j]))
-        for i, j in zip(*np.triu_indices(len(free), 1), strict=True)
-        if abs(correlation[i, j]) > HIGH_CORRELATION
-    ]
-    return sorted(pairs, key=lambda pair: -abs(pair[2]))
 
 
 def group_sentences(tests: Sequence[GroupTestRecord]) -> list[str]:

@@ -9,6 +9,7 @@ import numpy as np
 from markupsafe import Markup
 from skimage.measure import find_contours
 
+from adjust.display import CELLS
 from pipeline.drawing import svg
 from pipeline.report.numbers import fixed, fixed_list
 from pipeline.results.adjustment_record import JoinedFrameRecord, JoinRecord
@@ -22,9 +23,9 @@ LEAST_UM = 0.01  # µm, smallest residual that sets the scale: without redundanc
 JOINED_PLOT_PX = 420.0
 LONGEST_JOIN_PX = 40.0
 
-CELLS = 12  # along the longer side of the frame
 LEVELS = 7  # approximate number of contours
 LABEL_ROOM_PX = 46.0  # px, smallest distance between contour labels
+EDGE = 0.05  # of the frame: a label nearer to its edge would be cut
 
 
 @dataclass(frozen=True)
@@ -205,12 +206,14 @@ def contour_plot(on: Plane, x_mm: Array, y_mm: Array, sigma_um: Array, title: st
     if not high > 0.0:
         return None
     drawn, labels = [], list[tuple[float, float, str]]()
+    (left, bottom), (right, top) = on.page(on.corners_mm + EDGE * np.ptp(on.corners_mm, axis=0) * [[1.0], [-1.0]])
     for level in _levels(float(np.nanmin(sigma)), high):
         for line in find_contours(sigma, level):
             nodes = zip(line.T[::-1], (x_mm, y_mm), strict=True)
             page = on.page(np.stack([np.interp(at, np.arange(len(axis)), axis) for at, axis in nodes], axis=1))
             drawn.append(svg.line(page[:, 0], page[:, 1], "contour"))
-            free = [at for at in page.tolist() if all(math.dist(at, label[:2]) > LABEL_ROOM_PX for label in labels)]
+            inside = [(x, y) for x, y in page.tolist() if left < x < right and top < y < bottom]
+            free = [at for at in inside if all(math.dist(at, label[:2]) > LABEL_ROOM_PX for label in labels)]
             if len(line) > 3 and free:
                 labels.append((*free[len(free) // 2], f"{level:g}"))
     names = [svg.words(px, py + 4.0, text, "contour-label", "middle") for px, py, text in labels]

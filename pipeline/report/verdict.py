@@ -346,7 +346,7 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
     for note, images in images_by_sentence(shots, lambda frame: frame.scan.notes if frame.scan else ()).items():
         yield f"{listed(images)}: {note}"
     for status in (Status.WEAK, Status.PREDICTED, Status.REJECTED):
-        for kind, *words in (("target", "target"), ("tie", "sight of a tie point", "sights of tie points")):
+        for kind, *words in (("target", "target"), ("tie", "tie-point observation")):
             number = (
                 data.totals.of_targets.get((kind, status), 0)
                 if data.totals

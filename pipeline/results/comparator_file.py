@@ -29,7 +29,7 @@ _KINDS: dict[str, ObservationKind] = {kind: kind for kind in get_args(Observatio
 CameraPerson = tuple[str, str]  # camera and name of the reviewer
 _DECISIONS = re.compile(r'^"?# (\d+) decisions of (.+), camera (.+?)"?$', re.MULTILINE)
 _HEAD = 4096
-_PITCH = re.compile(r'^"?# pitch of (.+): ([0-9.e+-]+) um across, ([0-9.e+-]+) um down"?$', re.MULTILINE)
+_PITCH = re.compile(r'^"?# pitch of (.+): ([0-9.e+-]+) [uµ]m across, ([0-9.e+-]+) [uµ]m down"?$', re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True)  # archives have many
@@ -88,11 +88,12 @@ def comparator_lines(
         yield f"# measurement {measurement}\n"
     for (by, who), count in (decided or {}).items():
         yield f"# {count} decisions of {_single_line(who)}, camera {_single_line(by)}\n"
-    yield "# x_mm to the right, y_mm UP, origin at the centre of the scan's top-left pixel; sx_mm, sy_mm their sigmas\n"
+    yield "# x_mm to the right, y_mm UP, origin at the centre of the scan's top-left pixel\n"
+    yield "# sx_mm, sy_mm: standard deviations\n"
     yield "# col_px to the right, row_px down; the CENTRE of the top-left pixel is (0, 0)\n"
     for image, (x, y) in sorted(pitch_um.items()):
         if math.isfinite(x):
-            yield f"# pitch of {image}: {x:.10g} um across, {y:.10g} um down\n"
+            yield f"# pitch of {image}: {x:.10g} µm across, {y:.10g} µm down\n"
     yield "# status: only measured and weak are observations\n"
     yield f"{','.join(COLUMNS)}\n"
     for point in points:

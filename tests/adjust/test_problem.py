@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.quiver import Quiver
+from numpy.typing import NDArray
 
 from adjust import Adjustment, AdjustmentError, Distortion, Exterior, Network, ObjectPoint, Parameter, Prior, adjust
 from adjust.display import contour_levels, distance_text
@@ -251,6 +252,11 @@ def vectors(axes: Axes) -> list[Any]:
     return [each for each in axes.collections if isinstance(each, Quiver)]
 
 
+def rms_text(vectors: NDArray[np.float64]) -> str:
+    x, y = np.sqrt(np.mean(vectors**2, axis=0))
+    return f"{x:.3g} × {y:.3g}"
+
+
 def test_residuals_are_vectors_along_the_axes_of_the_picture(board: Adjustment) -> None:
     axes = board.plots(pixel_mm=PIXEL_MM).plot_residuals()
     (quiver,) = vectors(axes)
@@ -258,7 +264,7 @@ def test_residuals_are_vectors_along_the_axes_of_the_picture(board: Adjustment) 
     np.testing.assert_allclose(np.column_stack([quiver.U, quiver.V]), v_px)
     np.testing.assert_allclose(quiver.XY, board.network.observations.xy_mm / PIXEL_MM * [1.0, -1.0])
     assert axes.get_ylim()[0] > axes.get_ylim()[1]  # rows count downwards
-    assert "px a point" in axes.get_title(loc="left")
+    assert axes.get_title(loc="left").endswith(f"rms {rms_text(v_px)} px")
 
 
 def test_of_film_both_kinds_of_marks_are_shown_in_the_camera_frame(film: Adjustment) -> None:
@@ -266,7 +272,8 @@ def test_of_film_both_kinds_of_marks_are_shown_in_the_camera_frame(film: Adjustm
     kinds = vectors(axes)
     assert [len(each.U) for each in kinds] == [160, 20]
     assert np.abs(kinds[1].XY).max() == pytest.approx(113.0, abs=2.0)
-    assert "µm a point" in axes.get_title(loc="left")
+    v_um = np.concatenate([np.column_stack([each.U, each.V]) for each in kinds])
+    assert axes.get_title(loc="left").endswith(f"rms {rms_text(v_um)} µm")
     assert axes.get_xlabel() == "x' (mm)"
 
 

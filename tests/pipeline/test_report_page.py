@@ -84,10 +84,10 @@ def test_a_good_calibration_says_so_first_and_has_one_value_to_be_cited() -> Non
         "✓ Good",
         "Calibrated from 160 marks in 5 frames: RC 20 has c = 153.6640 ± 0.0041 mm.",
         "None: nothing here needs a look.",
-        "control given object coordinates; rms in millionths of their unit no check 0.00 0.00 0.0: no check",
         *(words for status in Status for words in (status, status.meaning)),
     ):
         assert words in document.text
+    assert "given object coordinates" not in document.text  # all are fixed
     assert [id for id in document.ids if not id.startswith("frame-")] == [
         "verdict", "camera", "problems", "frames", "marks", "coverage", "fiducials", "reliability", "check", "notes",
     ]  # fmt: skip
@@ -136,6 +136,7 @@ def test_standard_deviations_by_leaving_out_pictures_are_shown_where_they_are_la
 def test_an_archive_has_totals_first_and_corrections_in_words() -> None:
     film_alone = made_up_calibration.film_alone()
     document = rendered(film_alone)
+    assert "given object coordinates" not in document.text  # all are fixed
     assert [id for id in document.ids if not id.startswith("frame-")] == [
         "verdict", "totals", "problems", "frames", "marks", "fiducials", "reliability", "notes",
     ]  # fmt: skip
@@ -218,8 +219,8 @@ TRADE_OFF = CorrelationRecord(("IO.RC 20.c", "EO.*.Z0"), 0.98, "c and Z0 trade o
 @pytest.mark.parametrize(
     ("change", "words", "count"),
     [
-        (lambda data: data, "Exterior orientation (m, degrees)", 5),
-        (lambda data: replace(data, unit="mm"), "Exterior orientation (mm, degrees)", 5),
+        (lambda data: data, "Exterior orientation (m, °)", 5),
+        (lambda data: replace(data, unit="mm"), "Exterior orientation (mm, °)", 5),
         (lambda data: replace(data, measurement=None, thumbnail=None), "no pictures: the scans are not at hand.", 1),
         (lambda data: replace(data, check=None), "It has not been made: run reseau check .", 1),
         (lambda data: replace(data, covariance=None), "no distortion parameters, or their covariance is missing.", 1),
@@ -234,7 +235,7 @@ TRADE_OFF = CorrelationRecord(("IO.RC 20.c", "EO.*.Z0"), 0.98, "c and Z0 trade o
         (with_check("differs"), "! Needs a look", 1),
         (with_check("not possible"), "! Needs a look", 0),
         (with_two_rejected, "3, 5 rejected, such as 3: 4.2 px off the other marks' places.", 1),
-        (with_tie_points, "sights of tie points weak", 1),
+        (with_tie_points, "tie-point observations weak", 1),
         (with_tie_points, "targets", 0),
     ],
 )

@@ -26,7 +26,7 @@ from pipeline.report.frame_views import SIZE_PX, mark_picture
 from pipeline.report.lens import curves_plot, lens, lens_map
 from pipeline.report.load import report_data
 from pipeline.report.numbers import value_and_sigma
-from pipeline.report.parameters import high_correlations, parameter_rows
+from pipeline.report.parameters import parameter_rows
 from pipeline.report.plots import calibrated_cameras
 from pipeline.results.adjustment_file import Covariance
 from pipeline.results.adjustment_record import (
@@ -147,7 +147,7 @@ def test_coverage_is_counted_in_the_cell_of_each_observation() -> None:
     assert counts.shape == (vectors.CELLS // 2, vectors.CELLS)
     assert (counts[0, 0], counts[-1, -1], counts.sum()) == (2.0, 1.0, 3.0)
     drawn = re.findall(r'<rect [^>]*class="covered"[^>]*>', vectors.coverage_plot(FRAME, places_mm))
-    assert ['x="26' in drawn[0], 'y="276' in drawn[0], len(drawn)] == [True, True, 2]  # the page's y points down
+    assert ['x="26' in drawn[0], 'y="251' in drawn[0], len(drawn)] == [True, True, 2]  # the page's y points down
 
 
 def test_contours_of_a_field_that_grows_to_the_right_are_upright_lines_at_their_values() -> None:
@@ -157,8 +157,8 @@ def test_contours_of_a_field_that_grows_to_the_right_are_upright_lines_at_their_
     lines = re.findall(r'<path d="([^"]+)" class="contour"', plot)
     places = sorted(round(np.median([float(v) for v in re.findall(r"[\d.]+", line)[::2]]), 1) for line in lines)
     labels = sorted(float(text) for text in re.findall(r'class="contour-label"[^>]*>([\d.]+)<', plot))
-    assert labels[-3:] == [1.0, 2.0, 5.0]
-    assert [26.0 + 5.0 * 12.0 * value for value in labels] == pytest.approx(places, abs=0.2)
+    assert labels == [1.0, 2.0, 5.0]  # those of lines at the edge would be cut
+    assert [26.0 + 5.0 * 12.0 * value for value in labels] == pytest.approx(places[-3:], abs=0.2)
     assert vectors.contour_plot(FRAME, x_mm, y_mm, np.zeros((13, 25)), "field") is None
 
 
@@ -221,10 +221,6 @@ def test_parameters_say_what_is_significant_carried_by_a_prior_or_correlated() -
     assert "hardly from the observations" in rows["x₀′"].meaning
     assert rows["y₀′"].meaning == "held at the given value"
     assert "k2" not in rows, "a parameter that is fixed at 0 is no part of the model"
-    matrix = np.array([[4.0, 0.0, -1.9], [0.0, 1.0, 0.1], [-1.9, 0.1, 1.0]])
-    pairs = high_correlations("A", camera("torlegard", k3=1.0), covariance("A", ("c", "x0", "k3"), matrix))
-    assert [(first, second) for first, second, _ in pairs] == [("c", "k3")]
-    assert pairs[0][2] == pytest.approx(-0.95)
 
 
 GIVEN = np.array([(100.0, 100.0), (-100.0, 100.0), (-100.0, -100.0), (100.0, -100.0), (0.0, 110.0)])

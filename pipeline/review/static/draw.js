@@ -6,6 +6,7 @@ import { View, bitmap, by, guarded, json, tell } from "./view.js";
 const NEAR_PX = 11; // of the page: so near a handle, a press takes it
 const PARTS = ["disk", "ring", "bar", "polygon"];
 const CAMERA = ["name", "distance", "width", "height", "pitch", "sigma"];
+const LABEL_PX = [60, 16]; // room of a handle's name
 const COLOUR = { line: "#22c55e", handle: "#facc15", mark: "#fff", corner: "#38bdf8" };
 
 const drawing = { image: "", mark: null, marks: [], point: "", corners: [], placesCorners: false };
@@ -194,12 +195,12 @@ function showMarks() {
         row.append(one);
       };
       row.setAttribute("aria-selected", mark.id === drawing.point);
-      cell(button("Look", () => select(mark.id)));
+      cell(button("Show", () => select(mark.id)));
       cell(field(mark.id, `name of mark ${mark.id}`, (text) => rename(mark.id, text), "text"));
       for (const axis of [0, 1]) {
         const label = `${"xy"[axis]} of mark ${mark.id}, mm`;
         const given = field(mark.xy_mm[axis] ?? "", label, (text) => give(mark.id, axis, text), "number");
-        given.placeholder = mark.found_mm ? mark.found_mm[axis].toFixed(3) : "";
+        given.placeholder = mark.found_mm ? mark.found_mm[axis].toFixed(3).replace("-", "−") : "";
         cell(given);
       }
       cell(button("×", () => remove(mark.id)));
@@ -269,8 +270,10 @@ function drawMark(pen) {
     for (const outline of outlines) view.line(pen, outline, COLOUR.line, 1.5);
   }
   view.cross(pen, center, COLOUR.mark, 3, 9);
+  const named = [];
   for (const { key, px } of handles) {
     const [x, y] = view.canvasXY(...px);
+    const isFree = named.every(([u, v]) => Math.abs(u - x) > LABEL_PX[0] || Math.abs(v - y) > LABEL_PX[1]);
     pen.beginPath();
     pen.arc(x, y, 5, 0, 2 * Math.PI);
     pen.fillStyle = drag?.key === key ? "#fff" : COLOUR.handle;
@@ -278,7 +281,10 @@ function drawMark(pen) {
     pen.lineWidth = 1.5;
     pen.strokeStyle = "#000";
     pen.stroke();
-    if (drag?.key === key || handles.length < 8) view.name(pen, px, key.split(".").at(-1).replace(/_(mm|deg)$/, ""), COLOUR.handle);
+    if (drag?.key === key || (handles.length < 8 && isFree)) {
+      view.name(pen, px, key.split(".").at(-1).replace(/_(mm|deg)$/, ""), COLOUR.handle);
+      named.push([x, y]);
+    }
   }
   view.canvas.dataset.handles = JSON.stringify(Object.fromEntries(handles.map(({ key, px }) => [key, view.canvasXY(...px)])));
   view.canvas.dataset.view = JSON.stringify({ center: view.center, zoom: view.zoom }); // for tests, which click places of the scan

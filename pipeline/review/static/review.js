@@ -269,7 +269,8 @@ function showFacts(mark) {
   const facts = [["status", mark.status], ["camera", mark.camera], ["verdict of the scan", mark.verdict]];
   if (mark.center) facts.push(["column, row", mark.center.map((value) => value.toFixed(2)).join(", ")]);
   if (mark.covariance) facts.push(["sigmas", `${[0, 1].map((k) => Math.sqrt(mark.covariance[k][k]).toFixed(3)).join(", ")} px`]);
-  for (const { cause, sigma_px: sigma } of mark.causes.slice(0, 5)) facts.push([`of which ${cause}`, `${sigma.toFixed(3)} px`]);
+  const parts = mark.causes.filter(({ sigma_px: sigma }) => sigma >= 0.0005); // half of the last digit
+  for (const { cause, sigma_px: sigma } of parts.slice(0, 5)) facts.push([`of which ${cause}`, `${sigma.toFixed(3)} px`]);
   for (const name of ["snr", "likeness", "damaged_fraction", "second_method_sigmas"]) {
     if (name in mark.quality) facts.push([name.replaceAll("_", " "), mark.quality[name].toPrecision(3)]);
   }
@@ -297,7 +298,9 @@ async function showOthers(mark, generation) {
   const figures = await Promise.all(
     mark.others.map(({ image, place, half }) => smallPicture(image, place, half, image, `mark ${mark.point} in ${image}`)),
   );
-  if (generation === state.generation) by("others").replaceChildren(...figures);
+  if (generation !== state.generation) return;
+  by("others-view").hidden = !figures.length;
+  by("others").replaceChildren(...figures);
 }
 
 async function smallPicture(image, place, half, caption, label, marks = () => {}) {
@@ -319,7 +322,7 @@ async function smallPicture(image, place, half, caption, label, marks = () => {}
 
 async function openPose(entry, generation) {
   by("pose-view").hidden = by("pose-row").hidden = false;
-  by("pose-told").textContent = "How does the scan lie? Choose the picture that is upright and not mirrored.";
+  by("pose-told").textContent = "Scan orientation: choose the picture that is upright and not mirrored.";
   by("roll-label").hidden = entry.count === 1;
   by("roll-told").textContent = `The same for all ${entry.count} frames of the roll`;
   const frame = await json("/api/frame", { image: entry.image });
