@@ -342,15 +342,17 @@ def fit_lines_and_sharpening(frame: Frame, fewest: int = 0) -> Frame:
     before, last = frame.scan.tone.sharpening, None
     for _ in range(_SHARED_ROUNDS):
         drawn = _widen_drawings(frame, telling)
-        fits = (frame.detections[index].fit for index in telling)
-        scores = [fit.sharpening for fit in fits if fit and fit.sharpening and fit.sharpening.normal.any()]
+        fits = {index: frame.detections[index].fit for index in telling}
+        scores = {index: fit.sharpening for index, fit in fits.items() if fit and fit.sharpening}
         found = before
         if begun.agrees and len(scores) >= max(fewest, FEWEST_MARKS):
-            found = estimate_sharpening(before, scores, len(frame.scan.tone.mean)) or Sharpening()
+            found = estimate_sharpening(before, list(scores.values()), len(frame.scan.tone.mean)) or Sharpening()
         if drawn is frame and found.is_as(before):
             break
-        last, before = (before, found), found.accelerated(before, last)
         telling = telling[:_TELLING]
+        if before and last:  # of the others the detail is fitted, which tells nothing of it
+            telling = [index for index in telling if index in scores] or telling
+        last, before = (before, found), found.accelerated(before, last)
         frame = _refit(
             _replace_tone(drawn, drawn.scan.tone.sharpened(before)), dict.fromkeys(telling, options), orient=False
         )

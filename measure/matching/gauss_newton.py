@@ -84,12 +84,13 @@ def gauss_newton(model: Model, tolerance_px: float, iterations: int, halvings: i
     Outcome
     """
     outcome = Outcome(UNSETTLED, np.inf)
+    reversible = model if halvings and isinstance(model, ReversibleModel) else None  # a slow test
     for _ in range(iterations):
         step = model.solve()
         if step is None:
             return Outcome(UNDETERMINED, outcome.moved_px)
-        if halvings and isinstance(model, ReversibleModel):
-            outcome = Outcome(UNSETTLED, _halved_step(model, step, tolerance_px, halvings))
+        if reversible is not None:
+            outcome = Outcome(UNSETTLED, _halved_step(reversible, step, tolerance_px, halvings))
         else:
             outcome = Outcome(UNSETTLED, model.step(step))
         reason = model.failure()

@@ -247,15 +247,13 @@ def _precision(fit: PictureFit, noise: NoiseModel, landscape: Landscape) -> dict
 
 def _by_line_width(fit: PictureFit) -> Array | None:
     """(height, width) derivative by the logarithm of the width of a cross's lines. None for other marks."""
-    model, place = fit.model, fit.state.pixel_from_mark
+    model = fit.model
     if not (isinstance(model.mark, MarkShape) and model.mark.is_cross):
         return None
     height, width = model.grey.shape
-    wider, drawn = (
-        picture(mark, place, width, height, model.blur_px) for mark in (widen_lines(model.mark, _WIDER), model.mark)
-    )
-    change = model.detail(model.contrast_dn / np.log(_WIDER) * (wider - drawn))
-    return np.asarray(change * model.steadiness * model.slopes)
+    wider = picture(widen_lines(model.mark, _WIDER), fit.state.pixel_from_mark, width, height, model.blur_px)
+    change = model.detail(wider) * model.steadiness * model.slopes - model.design[-GREY]
+    return np.asarray(model.contrast_dn / np.log(_WIDER) * change)
 
 
 def _mark_tone(

@@ -204,16 +204,16 @@ class PictureModel:
         greys[0], greys[1:] = self.detail(shown.value), self.ground
         if not self.state.greys.any():
             self.state = State(place, self.state.variance_px2, factors(greys * used, self.grey))
-        columns[0], columns[1] = shown.by_col, shown.by_row
+        # In single precision, like the rendering.
         col, row = np.arange(width) - place[0, 2], (np.arange(height) - place[1, 2])[:, None]
-        moves = np.stack([slope * along for slope in columns[:2] for along in (col, row)])
+        slopes = shown.by_col, shown.by_row
+        moves = np.stack([slope * along.astype(np.float32) for slope in slopes for along in (col, row)])
         # The blur is not deformed with the mark; otherwise size, blur and contrast of a soft disk diverge together.
         moves += self.total_blur_px**2 * np.stack([shown.by_col_col, *[shown.by_col_row] * 2, shown.by_row_row])
-        columns[self.linear] = combined(self.generators.reshape(-1, 4), moves)
+        moving = [*slopes, *combined(self.generators.reshape(-1, 4).astype(np.float32), moves)]
         if self.blur is not None:
-            columns[self.blur] = -0.5 * shown.laplacian
-        if self.background_px is not None:
-            columns[:] = [self.detail(column) for column in columns]
+            moving.append(-0.5 * shown.laplacian)
+        columns[:] = [self.detail(image) for image in moving]
         columns *= -self.state.greys[0]
         self.residuals = self.grey - combined(self.state.greys, greys)
         if isinstance(self.mark, MarkTemplate):
