@@ -220,10 +220,11 @@ def test_files_that_say_the_same_in_other_letters_are_the_same(project: Path, tm
     assert own_summary["poses"]
 
 
-def test_an_end_after_measuring_leaves_all_as_it_was(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupt_leaves_all_as_it_was(project: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     before = results(project)
     monkeypatch.setattr(stages, "adjust_marks", Mock(side_effect=KeyboardInterrupt))
     assert command("run", project / "project.toml") == 130
+    assert "interrupted; files that were complete stay" in capsys.readouterr().err
     assert results(project) == before
 
 

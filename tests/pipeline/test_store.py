@@ -91,6 +91,7 @@ def test_a_lot_whose_input_was_tested_is_not_tested_again(path: Path) -> None:
         assert requests == ["a", "b", "c"]
         assert first.digest != second.digest
         second.drop_others()
+        assert (find_judging(store, first.digest), latest(store)) == (None, second)
         scans = list(second.scans())
         reasons = {scan.frame.image: [str(mark.reason) for mark in scan.frame.marks if mark.reason] for scan in scans}
         assert reasons == {"1": ["by a"], "2": ["by a"], "3": ["by c"], "4": ["by c"]}
