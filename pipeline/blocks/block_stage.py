@@ -489,9 +489,9 @@ def mapped(pictures: Sequence[BlockPicture], cameras: dict[str, CameraFile], fol
 
 
 def quiet_colmap() -> Any:
-    """pycolmap, with only errors logged."""
+    """pycolmap, without its log: what fails raises."""
     pycolmap = import_pycolmap("reseau block")
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     return pycolmap
 
 

@@ -185,7 +185,7 @@ def figure_plot(change: Figure) -> Markup:
     um = svg.round_step(70.0 / px_per_um)
     size = f"{um:g} µm, enlarged {1e3 * px_per_um / px_per_mm:,.0f} times"
     if px_per_um * radius.max() < VISIBLE_PX:
-        size += "; the ellipses are too small to show"
+        size += "; ellipses too small"
     content = [
         svg.line(corners[:, 0], corners[:, 1], "frame", closed=True),
         *svg.ellipses(ends, px_per_um * radius, angles),

@@ -293,7 +293,7 @@ def test_marks_are_shown_and_learned(project: Path, printed_line: Printed, refus
         page.keyboard.press("m")
         for name in "abc":  # its own picture tells nothing of the place in the scan that it is from
             expect(page.locator("#trial")).to_contain_text(
-                f"{name}: 4 {'weak' if name == shown else 'measured'}; pose 0."
+                f"{name}: 4 {'weak' if name == shown else 'measured'}; scan orientation 0."
             )
         expect(page.locator("#tries figure")).to_have_count(12)
         page.keyboard.press("Enter")

@@ -1,6 +1,7 @@
 """The command line on right and wrong input, what it suggests next, and the time that it expects."""
 
 import io
+import itertools
 import json
 import os
 import re
@@ -272,6 +273,17 @@ def lines(quiet: bool = False, terminal: bool = False) -> list[str]:
         for done in range(1, 31):
             count("2 of 5 groups", done, 30, left_s=200.0)
     return text.getvalue().splitlines()
+
+
+def test_the_time_left_is_estimated_from_the_second_item_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thirty seconds an item; the first also loads what all need."""
+    text, seconds = io.StringIO(), itertools.count(0.0, 30.0)
+    monkeypatch.setattr("pipeline.progress.time.monotonic", lambda: next(seconds))
+    with Reporter(PlainConsole(file=text, width=200)).stage("reading scan") as count:
+        for done, name in enumerate(("a", "b"), 1):
+            count(name, done, 6)
+    first, second = text.getvalue().splitlines()
+    assert (first, second) == ("reading scan 1 of 6, a", "reading scan 2 of 6, b, about 2 minutes left")
 
 
 def test_progress_is_two_lines_without_a_terminal_and_none_for_who_is_quiet() -> None:

@@ -177,7 +177,7 @@ def place_frame_by_keys(page: Page) -> None:
         review.steer(page, "near", review.mark_px(review.TURNED, number))
         page.keyboard.press("Enter")
     page.keyboard.press("m")
-    expect(page.locator("#trial")).to_contain_text("4 measured; pose 0.")
+    expect(page.locator("#trial")).to_contain_text("4 measured; scan orientation 0.")
     page.keyboard.press("Enter")
 
 
