@@ -581,7 +581,6 @@ def _scattering_film(shared: Explanation, film: BelievedFilm) -> Reason:
 
 
 def _distances(names: Sequence[str], off_mm: Array) -> str:
-    """List the marks with the largest deviations."""
     worst = np.argsort(-off_mm, kind="stable")[:_NAMED_MARKS]
     rest = f", {len(names) - len(worst)} others by less" if len(names) > len(worst) else ""
     return ", ".join(f"{names[k]} by {off_mm[k]:.3f} mm" for k in worst) + rest

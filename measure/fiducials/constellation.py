@@ -152,7 +152,6 @@ def _fit_similarity(from_: Complex, to: Complex, weight: Array) -> tuple[Complex
 
 
 def _similarity_matrix(scale: complex | Complex, offset: complex | Complex) -> Array:
-    """(2, 3) matrix of a similarity."""
     return np.array([[scale.real, -scale.imag, offset.real], [scale.imag, scale.real, offset.imag]])
 
 
@@ -167,10 +166,7 @@ def lattice_steps_mm(camera_mm: Array, within_mm: float) -> Array:
 
 
 def same_picture(
-    marks: Sequence[LayoutMark],
-    first: tuple[str, Sequence[int]],
-    second: tuple[str, Sequence[int]],
-    within_mm: float,
+    marks: Sequence[LayoutMark], first: tuple[str, Sequence[int]], second: tuple[str, Sequence[int]], within_mm: float
 ) -> bool:
     """Whether two poses have equal marks at equal places. first, second: pose and kind of template of every mark."""
     xy = np.array([mark.xy_mm for mark in marks])

@@ -16,16 +16,7 @@ from scipy.special import ndtr
 from measure.array_types import Array, Mask
 from measure.fiducials.frame import WRONG_PX, Frame
 from measure.fiducials.mark_fit import Detection
-from measure.flags import (
-    FALSE_DOUBT,
-    LARGE_ERROR,
-    MARK_UNLIKE_THE_OTHERS,
-    NO_REASON,
-    Cause,
-    Code,
-    Reason,
-    Status,
-)
+from measure.flags import FALSE_DOUBT, LARGE_ERROR, MARK_UNLIKE_THE_OTHERS, NO_REASON, Cause, Code, Reason, Status
 from measure.geometry import linear_scale
 from measure.marks.rendering import mark_window, picture, reach_px
 from measure.marks.shapes import Bar, Disk, Mark, MarkShape, Ring
@@ -49,6 +40,7 @@ _SPECK_MM2 = 0.00125
 _TOUCHED_PX = 0.3  # rms displacement of the edges of wedges and notches that the background touches
 # A local displacement of an outline shifts the centre by twice as much as it changes the mean radius.
 _AS_MUCH = 2.0
+_MOST_UNEQUAL = 10.0  # logarithm of a size ratio: the edges of a wedge may leave its size open by any amount
 _FEWEST_FRAMES = 3  # needed: of two, either may be the outlier
 _NEAR = 3.0  # standard deviations from the median, within which frames agree
 _WIDTH_SIGMA = 0.15  # standard deviation of the logarithm of the width of a frame's lines over the drawn one
@@ -155,7 +147,6 @@ def shared_blurs(fits: Sequence[MarkFit]) -> list[SharedBlur | None]:
 
 
 def _log_total_px(blur_px: float) -> float:
-    """Logarithm of the total blur, pixel included."""
     return float(np.log(blur_px**2 + PIXEL_VARIANCE_PX2) / 2)
 
 
@@ -197,7 +188,6 @@ class SharedShape:
 
 
 def _density(off: Array, sigma: Array) -> float:
-    """Density of independent normal deviations."""
     return float(np.prod(np.exp(-0.5 * (off / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)))
 
 
@@ -309,9 +299,8 @@ def _shape_figures(fit: MarkFit, linear: Array, is_held: bool) -> tuple[Array, A
 def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape, sigma: Array) -> Detection:
     """Store the shape of a mark relative to the others, and doubt an outlier. sigma (k,): of the mark's own figures."""
     mark, is_damaged, touch = frame.layout.marks[index].mark, fit.damaged_fraction > 0, None
-    figures = dict(
-        zip(("size_ratio", "turn_rad"), (float(np.exp(shape.off[0])), *shape.off[1:].tolist()), strict=False)
-    )
+    size_ratio = float(np.exp(np.clip(shape.off[0], -_MOST_UNEQUAL, _MOST_UNEQUAL)))
+    figures = dict(zip(("size_ratio", "turn_rad"), (size_ratio, *shape.off[1:].tolist()), strict=False))
     figures |= dict(zip(("size_sigma", "turn_sigma"), sigma.tolist(), strict=False))
     if isinstance(mark, MarkShape) and mark.is_cross:
         place = np.column_stack([frame.linear(index), fit.center_px])

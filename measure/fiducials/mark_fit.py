@@ -53,10 +53,7 @@ class Detection:
         return self.fit is not None and self.fit.is_clear
 
     def amend(
-        self,
-        *reasons: Reason,
-        parts: Mapping[Cause, Array] | None = None,
-        figures: Mapping[str, float] | None = None,
+        self, *reasons: Reason, parts: Mapping[Cause, Array] | None = None, figures: Mapping[str, float] | None = None
     ) -> "Detection":
         """Add reasons why the fit may be wrong, parts (2, 2) of its covariance, and figures."""
         fit, reason = self.fit, Reason.combine((self.reason, *reasons))

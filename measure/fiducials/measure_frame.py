@@ -20,13 +20,7 @@ from measure.fiducials.constellation import NARROW, Placement
 from measure.fiducials.faint_marks import detect_faint_marks, faint_reach_px
 from measure.fiducials.frame import LEAST_SIGNIFICANCE, MANY, REDUCED_PX, Frame
 from measure.fiducials.interior_orientation import film_terms, fit_frame, interleaved
-from measure.fiducials.mark_comparison import (
-    SharedBlur,
-    compare_shapes,
-    shared_blurs,
-    shared_line_width,
-    unlike_blur,
-)
+from measure.fiducials.mark_comparison import SharedBlur, compare_shapes, shared_blurs, shared_line_width, unlike_blur
 from measure.fiducials.mark_fit import Detection, detect_mark, not_found, strain_error_px
 from measure.fiducials.options import SCATTER_DEGREES, FiducialOptions
 from measure.fiducials.significance import random_matches
@@ -141,10 +135,7 @@ def registered_channels(peaks: Sequence[Sequence[tuple[Array, float]]]) -> tuple
 
 
 def best_weights(
-    scan: Scan,
-    marks: Sequence[tuple[Mark, Array, int]],
-    signs: Sequence[int] = (1,),
-    among: Sequence[int] = (0, 1, 2),
+    scan: Scan, marks: Sequence[tuple[Mark, Array, int]], signs: Sequence[int] = (1,), among: Sequence[int] = (0, 1, 2)
 ) -> tuple[tuple[float, ...], int] | None:
     """Estimate channel weights by Fisher's linear discriminant.
 
@@ -237,11 +228,8 @@ def orient_frame(frame: Frame) -> Frame:
     covariances = np.array([scaled @ fit.covariance_px2 @ scaled for fit in fits if fit])
     given = np.array([min(*frame.layout.marks[i].sigma_mm, MOST_GIVEN_SIGMA_MM) for i in index])
     covariances += given[:, None, None] ** 2 * np.eye(2)
-    film, camera, model = (
-        Scatter(frame.options.film_sigma_mm, SCATTER_DEGREES),
-        frame.camera_mm,
-        frame.options.film_model,
-    )
+    film = Scatter(frame.options.film_sigma_mm, SCATTER_DEGREES)
+    camera, model = frame.camera_mm, frame.options.film_model
     clicked = {click.point for click in frame.options.clicks}
     known = frame.certain | [mark.id in clicked for mark in frame.layout.marks]
     out = gross_errors(FrameMarks.from_places(camera[index], up, covariances, model), film, frame.options.gate_mm)
@@ -395,24 +383,20 @@ def refit_frame(frame: Frame) -> Frame:
 
 def _refit_with_blur(frame: Frame) -> Frame:
     """Refit faint marks and those with a poorly determined blur, with the blur of the others as an observation."""
-    drawn = {
-        index: fit for index, fit in frame.inlier_fits.items() if isinstance(frame.layout.marks[index].mark, MarkShape)
-    }
+    marks, match, detections = frame.layout.marks, frame.options.match, frame.detections
+    drawn = {index: fit for index, fit in frame.inlier_fits.items() if isinstance(marks[index].mark, MarkShape)}
     faint = {index: fit for index, fit in drawn.items() if fit.covariance is None}
-    fits = {
-        index: fit for index, fit in drawn.items() if index not in faint and frame.detections[index].is_clear
-    } | faint
+    fits = {index: fit for index, fit in drawn.items() if index in faint or detections[index].is_clear}
     shared = dict(zip(fits, shared_blurs(list(fits.values())), strict=True))
-    options = {
-        index: replace(frame.options.match, blur_px=blur.blur_px, blur_sigma=blur.sigma)
-        for index, blur in shared.items()
-        if blur is not None
-    }
+    known = {index: blur for index, blur in shared.items() if blur is not None}
+    options = {index: replace(match, blur_px=blur.blur_px, blur_sigma=blur.sigma) for index, blur in known.items()}
     matched = _refit(frame, {index: each for index, each in options.items() if index not in faint}, orient=False)
     sigma = _linear_sigma(frame)
-    again = {index: _fit_again(frame, index, options.get(index, frame.options.match), sigma) for index in faint}
-    better = {index: fit for index, fit in again.items() if fit and _is_better(faint[index], fit, shared[index])}
-    matched, amended = matched.replace_fits(better), {}
+    again = {index: _fit_again(frame, index, options.get(index, match), sigma) for index in faint}
+    matched = matched.replace_fits(
+        {index: choose_fit(faint[index], fit, shared[index]) for index, fit in again.items()}
+    )
+    amended = {}
     total_px = {index: float(np.sqrt(fit.blur_px**2 + PIXEL_VARIANCE_PX2)) for index, fit in fits.items()}
     usual_px = float(np.median(list(total_px.values()))) if total_px else 1.0
     for index, blur in shared.items():
@@ -423,12 +407,19 @@ def _refit_with_blur(frame: Frame) -> Frame:
     return matched.replace_detections(amended)
 
 
-def _is_better(before: MarkFit, fit: MarkFit, blur: SharedBlur | None) -> bool:
-    """Whether the fit of a faint mark replaces its filtered place: same mark, others' blur, smaller sigma."""
-    if blur is not None and not blur.is_confirmed(fit):
-        return False
-    off = fit.center_px - before.center_px
-    return fit.sigma_px < before.sigma_px and may_be_noise(off, before.covariance_px2 + fit.covariance_px2)
+def choose_fit(filtered: MarkFit, fit: MarkFit | None, blur: SharedBlur | None) -> MarkFit:
+    """Choose between the filtered place of a faint mark and its fit, which has to have the others' blur.
+
+    Both are of the same pixels. Where the fit is not taken, the difference is what the filter's template, of the
+    others' sharpness and of lines as drawn, may have moved the place.
+    """
+    if fit is None or (blur is not None and not blur.is_confirmed(fit)):
+        return filtered
+    off = fit.center_px - filtered.center_px
+    if fit.sigma_px < filtered.sigma_px and may_be_noise(off, filtered.covariance_px2 + fit.covariance_px2):
+        return fit
+    covariance = filtered.place_covariance.plus(Cause.SECOND_METHOD, np.outer(off, off))
+    return replace(filtered, place_covariance=covariance)
 
 
 def _refit_with_tone(frame: Frame) -> Frame:
@@ -436,9 +427,7 @@ def _refit_with_tone(frame: Frame) -> Frame:
     sigma, options = _linear_sigma(frame), frame.options.match
     pending = [index for index, fit in frame.clear_fits.items() if _needs_frame(frame, index, fit, sigma)]
     best = _refit(frame, dict.fromkeys(pending, options))
-    if (
-        _linear_sigma(best) < _BETTER_KNOWN * sigma
-    ):  # the places, far less certain before, had left the frame's scale open
+    if _linear_sigma(best) < _BETTER_KNOWN * sigma:  # the uncertain places of before had left the frame's scale open
         best = _refit(best, dict.fromkeys(pending, options))
     best = _settle_tone(best)
     is_open = (

@@ -44,10 +44,7 @@ _FEWEST_MARKS = 3
 
 
 def measure_fiducials(
-    scan: Scan,
-    layout: FiducialLayout,
-    pitch_um: tuple[float, float] | None,
-    options: FiducialOptions | None = None,
+    scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions | None = None
 ) -> FrameMeasurement:
     """Measure every mark of the layout in the scan.
 

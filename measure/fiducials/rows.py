@@ -41,11 +41,7 @@ def _absent_marks(layout: FiducialLayout, reason: Reason) -> tuple[MarkMeasureme
 
 
 def absent_frame(
-    scan: Scan,
-    layout: FiducialLayout,
-    reason: Reason,
-    rotation_deg: float,
-    pitch_um: tuple[float, float] | None,
+    scan: Scan, layout: FiducialLayout, reason: Reason, rotation_deg: float, pitch_um: tuple[float, float] | None
 ) -> FrameMeasurement:
     """Return the result for a scan in which no frame was found.
 
@@ -84,11 +80,7 @@ def _too_coarse(layout: FiducialLayout, pitch_um: float) -> Reason:
 
 
 def present_frame(
-    frame: Frame,
-    pose: Pose,
-    pitch_um: tuple[float, float] | None,
-    problems: Sequence[Reason],
-    chance: Reason,
+    frame: Frame, pose: Pose, pitch_um: tuple[float, float] | None, problems: Sequence[Reason], chance: Reason
 ) -> FrameMeasurement:
     """Return the result for a frame that was found.
 
@@ -126,7 +118,6 @@ def _unmeasured(point: str, detection: Detection, place_px: Array, why: Reason) 
 
 
 def _problems(frame: Frame, pitch_um: tuple[float, float] | None) -> list[Reason]:
-    """Problems of the interior orientation: an implausible stretch, or no redundancy."""
     problems = []
     per_mm = np.hypot(*frame.pixel_from_camera[:, :2].T)
     given = pitch_um or (1.0, 1.0)

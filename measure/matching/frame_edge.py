@@ -289,10 +289,7 @@ def _corner_tone(tones: Sequence[MarkTone], by_lines: Sequence[Array]) -> MarkTo
     misfit = both.sum_of_squares - both.right_side @ np.linalg.pinv(both.matrix, hermitian=True) @ both.right_side
     more = max(float(misfit) / (both.count - len(both.right_side)), 1.0)
     information = replace(
-        both,
-        matrix=both.matrix / more,
-        right_side=both.right_side / more,
-        sum_of_squares=both.sum_of_squares / more,
+        both, matrix=both.matrix / more, right_side=both.right_side / more, sum_of_squares=both.sum_of_squares / more
     )
     on_place = np.asarray(sum(by @ each.on_place for by, each in zip(by_lines, tones, strict=True)))
     return MarkTone(information, on_place, min(each.least for each in tones), max(each.greatest for each in tones))

@@ -27,19 +27,8 @@ from measure.matching.covariance import (
     sloping_place,
 )
 from measure.matching.gauss_newton import EDGE_BLURS, PictureFit
-from measure.matching.models import (
-    GREY,
-    MatchOptions,
-    PictureModel,
-    State,
-    background_px,
-    smoothed_px2,
-)
-from measure.matching.tone_information import (
-    mark_tone_information,
-    sharpening_score,
-    tone_without_information,
-)
+from measure.matching.models import GREY, MatchOptions, PictureModel, State, background_px, smoothed_px2
+from measure.matching.tone_information import mark_tone_information, sharpening_score, tone_without_information
 from measure.matching.window import ScanWindow, clear_of_ends
 from measure.noise.grain import blank_patches, grain_model, is_coloured
 from measure.noise.noise_model import NoiseModel, as_if_white, combined, factors, is_textured, products

@@ -14,12 +14,13 @@ from measure.fiducials import mark_comparison
 from measure.fiducials.constellation import Placement
 from measure.fiducials.frame import Frame
 from measure.fiducials.mark_fit import not_found
-from measure.fiducials.measure_frame import detect_frame, measure_frame, orient_frame
+from measure.fiducials.measure_frame import choose_fit, detect_frame, measure_frame, orient_frame
 from measure.fiducials.rows import absent_frame
 from measure.fiducials.stages import explain_misfit
-from measure.flags import Cause
+from measure.flags import NO_REASON, Cause
+from measure.marks.shapes import polygon
 from measure.matching.gauss_newton import UNSETTLED
-from measure.results import Covariance
+from measure.results import Covariance, MarkFit, OwnShape
 from measure.tone.curve import LINEAR
 
 PIXEL = 1 / 12
@@ -37,6 +38,19 @@ def test_a_faint_mark_gets_the_blur_of_the_others_and_those_need_none() -> None:
     assert shared[4] is not None
     assert np.hypot(shared[4].blur_px, np.sqrt(PIXEL)) == pytest.approx(1.2, rel=0.01)
     assert not shared[4].differs
+
+
+@pytest.mark.parametrize("sigma_px", [0.04, 0.1])
+def test_a_faint_mark_claims_what_its_fit_lies_off_unless_that_is_taken(sigma_px: float) -> None:
+    def faint(col: float, sigma: float) -> MarkFit:
+        place = np.array([[1.0, 0.0, col], [0.0, 1.0, 7.0]])
+        return MarkFit(True, NO_REASON, place[:, 2], Covariance.from_noise(sigma**2 * np.eye(2)), place)
+
+    chosen = choose_fit(faint(5.0, 0.06), faint(5.1, sigma_px), None)
+    if sigma_px < 0.06:
+        assert center(chosen)[0] == 5.1
+    else:
+        np.testing.assert_allclose(chosen.covariance_px2, np.diag([0.06**2 + 0.1**2, 0.06**2]))
 
 
 def test_a_width_of_lines_that_most_crosses_show_is_taken_and_that_of_few_is_not() -> None:
@@ -203,6 +217,17 @@ KNOWN = Covariance.from_noise(0.2**2 * np.eye(2))
 def test_the_verdict_on_a_mark(plain: Frame, own: dict[str, Any], others: dict[str, Any], status: Status) -> None:
     fits = {k: replace(fit, **(others if k else own)) for k, fit in enumerate(plain.fits) if fit is not None}
     assert plain.replace_fits(fits).verdict(0)[0] is status
+
+
+def test_a_size_that_edges_leave_open_is_a_finite_figure(plain: Frame) -> None:
+    wedge, open_size = MarkShape(polygon([(0, 0), (0.9, -0.5), (0.9, 0.5)])), np.array([5e3, 0.1])
+    layout = replace(plain.layout, marks=tuple(replace(mark, mark=wedge) for mark in plain.layout.marks))
+    shapes = {n: OwnShape(np.array([5e4 * n, 0.0]), open_size, np.zeros((2, 2))) for n in plain.inlier_fits}
+    fits = {n: replace(fit, own_shape=shapes[n]) for n, fit in plain.inlier_fits.items()}
+    compared = mark_comparison.compare_shapes(replace(plain, layout=layout).replace_fits(fits))
+    ratios = [fit.figures["size_ratio"] for fit in compared.inlier_fits.values()]
+    assert len(ratios) == len(fits)
+    assert np.isfinite(ratios).all()
 
 
 def test_what_widens_a_mark_is_added_to_its_covariance_under_its_cause(plain: Frame) -> None:
