@@ -6,6 +6,7 @@ benchmarks/review_faults.py.
 """
 
 import json
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -58,12 +59,22 @@ def report(folder: Path) -> None:
 
 
 def archive(folder: Path) -> tuple[Path, Mapping[str, review_faults.Truth]]:
-    """The measured project with faults, and its true values."""
+    """A project with a frame for each fault, not measured yet, and its true values."""
     review_faults.FRAMES = FRAMES
     truths = review_faults.planted(folder / "archive", np.random.default_rng(1))
-    project = folder / "archive" / "project.toml"
-    reseau("measure", project)
-    return project, truths
+    return folder / "archive" / "project.toml", truths
+
+
+def box_of_scans(folder: Path) -> tuple[Path, Mapping[str, review_faults.Truth]]:
+    """Four scans of the archive that show all marks, in a project without a camera."""
+    project, truths = archive(folder)
+    names = [_frame(truths, kind) for kind in ("turned", "mirrored", "stamp", "doubtful")]
+    scans = folder / "box1" / "scans"
+    scans.mkdir(parents=True)
+    for name in names:
+        shutil.copy(project.parent / "scans" / f"{name}.tif", scans)
+    shutil.copy(project, scans.parent)
+    return scans.parent / "project.toml", {name: truths[name] for name in names}
 
 
 @contextmanager
@@ -80,6 +91,7 @@ def shown(project: Path, size: dict[str, int], scheme: Literal["light", "dark"])
 def review(folder: Path) -> None:
     """review-pose.png, review-mark.png and review-frame.png."""
     project, truths = archive(folder)
+    reseau("measure", project)
     with shown(project, LARGE, "dark") as page:
         page.locator("#queue button", has_text=f"{_frame(truths, 'pose hidden')}: scan orientation").first.click()
         expect(page.locator("#poses button").first).to_be_visible()
@@ -104,7 +116,7 @@ def _frame(truths: Mapping[str, review_faults.Truth], kind: str) -> str:
 
 def learn(folder: Path) -> None:
     """review-learn.png: marks that nobody has drawn, clicked in one scan."""
-    project, truths = archive(folder)
+    project, truths = box_of_scans(folder / "learn")
     text = f'name = "K"\nframe_mm = [16.0, 16.0]\n{LEARNED}[mark.m]\nkind = "learned"\nsize_mm = 2.2\n'
     project.with_name("camera.toml").write_text(text, encoding="utf-8")
     with shown(project, SMALL, "light") as page:
@@ -129,8 +141,7 @@ def _click_marks(page: Page, truth: review_faults.Truth, numbers: str) -> None:
 
 def draw(folder: Path) -> None:
     """draw-camera.png: a ring-cross whose ring line is still too wide."""
-    project, truths = archive(folder)
-    project.with_name("camera.toml").unlink()
+    project, truths = box_of_scans(folder / "draw")
     sizes = {"arm_mm": 0.8, "line_mm": 0.1, "ring_mm": 0.5, "ring_line_mm": 0.13, "gap_mm": 0.0}
     with shown(project, {"width": 992, "height": 952}, "light") as page:
         expect(page.locator("#draw-view")).to_be_visible()
