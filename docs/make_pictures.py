@@ -29,7 +29,7 @@ from pipeline.results.adjustment_file import read_adjustment
 DOCS = Path(__file__).parent
 FRAMES = 20  # of the archive: one with each fault
 SETTLED_MS = 10_000  # until all images on the review page are there
-COLOURS = 128
+COLOURS = 256
 SMALL = {"width": 800, "height": 1250}
 LARGE = {"width": 1300, "height": 1000}
 LEARNED = "".join(
@@ -68,7 +68,7 @@ def archive(folder: Path) -> tuple[Path, Mapping[str, review_faults.Truth]]:
 def box_of_scans(folder: Path) -> tuple[Path, Mapping[str, review_faults.Truth]]:
     """Four scans of the archive that show all marks, in a project without a camera."""
     project, truths = archive(folder)
-    names = [_frame(truths, kind) for kind in ("turned", "mirrored", "stamp", "doubtful")]
+    names = [_frame(truths, kind) for kind in ("turned", "mirrored", "pose hidden", "doubtful")]
     scans = folder / "box1" / "scans"
     scans.mkdir(parents=True)
     for name in names:
@@ -142,8 +142,8 @@ def _click_marks(page: Page, truth: review_faults.Truth, numbers: str) -> None:
 def draw(folder: Path) -> None:
     """draw-camera.png: a ring-cross whose ring line is still too wide."""
     project, truths = box_of_scans(folder / "draw")
-    sizes = {"arm_mm": 0.8, "line_mm": 0.1, "ring_mm": 0.5, "ring_line_mm": 0.13, "gap_mm": 0.0}
-    with shown(project, {"width": 992, "height": 952}, "light") as page:
+    sizes = {"arm_mm": 0.8, "line_mm": 0.1, "ring_mm": 0.5, "ring_line_mm": 0.1, "gap_mm": 0.0}
+    with shown(project, {"width": 992, "height": 1150}, "light") as page:
         expect(page.locator("#draw-view")).to_be_visible()
         scan = page.locator("#draw-scan").input_value()
         with Image.open(project.parent / "scans" / f"{scan}.tif") as picture:
@@ -155,10 +155,16 @@ def draw(folder: Path) -> None:
             page.locator("#draw-whole").click(position={"x": float(x), "y": float(y)})
         page.locator("#draw-kind").select_option("ring-cross")
         for key, value in sizes.items():
-            page.locator(f"#size-{key}").fill(str(value))
-            page.locator(f"#size-{key}").press("Enter")
-        page.wait_for_function("document.getElementById('draw-left').dataset.shown")
+            _fill(page, key, value)
+        page.locator("#draw-fit").click()
+        expect(page.locator("#draw-told")).to_contain_text("Fitted", timeout=300_000)
+        _fill(page, "ring_line_mm", 0.15)
         _take(page, "draw-camera")
+
+
+def _fill(page: Page, key: str, value: float) -> None:
+    page.locator(f"#size-{key}").fill(str(value))
+    page.locator(f"#size-{key}").press("Enter")
 
 
 def _take(page: Page, name: str) -> None:
@@ -168,7 +174,7 @@ def _take(page: Page, name: str) -> None:
     path = DOCS / f"{name}.png"
     page.screenshot(path=path)
     with Image.open(path) as picture:
-        few = picture.convert("RGB").quantize(COLOURS)
+        few = picture.convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE)
     few.save(path, optimize=True)
 
 
