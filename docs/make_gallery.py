@@ -107,8 +107,8 @@ def draw(path: Path) -> None:
     from matplotlib import pyplot
 
     rows = -(-len(CATALOGUE) // COLUMNS)
-    figure, panels = pyplot.subplots(rows, COLUMNS, figsize=(9.0, 2.6 * rows), layout="constrained")
-    figure.get_layout_engine().set(h_pad=0.12)
+    figure, panels = pyplot.subplots(rows, COLUMNS, figsize=(9.0, 2.6 * rows))
+    figure.set_layout_engine("constrained", h_pad=0.12)
     for panel in panels.flat[len(CATALOGUE) :]:
         panel.axis("off")
     for number, (panel, failure) in enumerate(zip(panels.flat, CATALOGUE.values(), strict=False), 1):

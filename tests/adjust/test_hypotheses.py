@@ -117,7 +117,7 @@ def test_each_image_with_a_principal_distance_of_its_own_is_no_two_groups(seed: 
     assert [each.kind for each in result.explanations] == ["distances"]
     cause = result.explanations[0].cause
     percent, sigma, first, last = re.findall(r"by (\S+) ± (\S+) % between im(\d+) and im(\d+): focus", cause)[0]
-    assert (int(first), int(last)) == (zooms.argmin(), zooms.argmax())
+    assert (int(first), int(last)) == (int(zooms.argmin()), int(zooms.argmax()))
     longest, shortest = faults.C_MM + 0.3 * zooms.max(), faults.C_MM + 0.3 * zooms.min()
     assert abs(float(percent) - 100.0 * (longest / shortest - 1.0)) < 4.0 * float(sigma)
 

@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import re
 import sys
 import tomllib
@@ -249,7 +250,7 @@ def test_a_calibration_is_plotted_and_shown_in_a_notebook(
     assert axes.get_xlabel() == "column (px)"
     before, by_axis = axes.get_title(loc="left").removesuffix(" px").split(", rms ")
     assert before == "camera-400x320: residuals"
-    assert np.hypot(*map(float, by_axis.split(" × "))) == pytest.approx(result["cameras"][0]["rms_px"], rel=0.01)
+    assert math.hypot(*map(float, by_axis.split(" × "))) == pytest.approx(result["cameras"][0]["rms_px"], rel=0.01)
     assert max(axes.dataLim.intervalx) < SIZE_PX[0] + 30
     assert calibration._repr_html_().count("<tr>") == 9  # fx, fy, cx, cy, k1, k2, p1, p2
     assert repr(calibration).startswith("Calibration(camera-400x320: fx 520.")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from projects import Refusal, command, present, write_network_project
 
 from adjust import Parameter, adjust, approximate
+from adjust.display import CELLS
 from adjust.functional_model.lens import Lens
 from adjust.quality.lens_uncertainty import distortion_curves
 from measure.flags import NO_REASON, Status
@@ -144,7 +145,7 @@ FRAME = vectors.Plane(np.array([[-60.0, -30.0], [60.0, 30.0]]), 652.0)  # 5 px p
 def test_coverage_is_counted_in_the_cell_of_each_observation() -> None:
     places_mm = np.array([[-59.0, -29.0], [-58.0, -21.0], [59.0, 29.0]])
     counts, _, _ = vectors.coverage_counts(FRAME, places_mm)
-    assert counts.shape == (vectors.CELLS // 2, vectors.CELLS)
+    assert counts.shape == (CELLS // 2, CELLS)
     assert (counts[0, 0], counts[-1, -1], counts.sum()) == (2.0, 1.0, 3.0)
     drawn = re.findall(r'<rect [^>]*class="covered"[^>]*>', vectors.coverage_plot(FRAME, places_mm))
     assert ['x="26' in drawn[0], 'y="251' in drawn[0], len(drawn)] == [True, True, 2]  # the page's y points down
