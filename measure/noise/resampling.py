@@ -9,7 +9,7 @@ shows nothing of it.
 import numpy as np
 from scipy.ndimage import median_filter
 
-from measure.array_types import Array
+from measure.array_types import Array, Single
 from measure.scans.scan import Scan
 
 NEAREST_PX2 = np.eye(2) / 12  # covariance of a place: errors are uniform over a pixel
@@ -26,11 +26,14 @@ _SIGNIFICANT = 5.0  # standard deviations of a regular jump: film, compressed, s
 
 def is_nearest_neighbour(scan: Scan) -> bool:
     """Whether a scan was turned or enlarged with nearest neighbours."""
-    wide, tall = (min(side, _LONG_PX) for side in (scan.width_px, scan.height_px))
+    sides = scan.width_px, scan.height_px
+    wide, tall = (min(side, _LONG_PX) for side in sides)
     broad = min(wide, tall, _WIDE_PX)
+    # From multiples of the width, those of tiles: a strip across two rows of them would decode both.
+    left, top = ((side - broad) // 2 // broad * broad for side in sides)
     strips = [
-        np.asarray(scan.window((scan.width_px - width) // 2, (scan.height_px - height) // 2, width, height), float)
-        for width, height in ((broad, tall), (wide, broad))
+        scan.window(left, (scan.height_px - tall) // 2, broad, tall),
+        scan.window((scan.width_px - wide) // 2, top, wide, broad),
     ]
     rows, columns = strips[0], strips[1].T
     if min(len(rows), len(columns)) < _FEWEST_STEPS * _LEAST_DISTANCE_PX:
@@ -38,7 +41,7 @@ def is_nearest_neighbour(scan: Scan) -> bool:
     return _jump_alike([_jumps(rows), -_jumps(columns)]) or _stand_twice(rows) or _stand_twice(columns)
 
 
-def _stand_twice(rows: Array) -> bool:
+def _stand_twice(rows: Single) -> bool:
     """Whether rows equal the one before at regular distances."""
     copies = np.flatnonzero((rows[1:] == rows[:-1]).all(axis=1))
     distances = np.diff(copies)[np.diff(copies) > 1]  # neighbours that are all alike are saturated
@@ -46,12 +49,12 @@ def _stand_twice(rows: Array) -> bool:
     return usual >= _LEAST_DISTANCE_PX and bool(np.mean(np.abs(distances - usual) <= 1) > _MOSTLY)
 
 
-def _jumps(rows: Array) -> Array:
+def _jumps(rows: Single) -> Array:
     """(n - 1,) how much better each row continues the one before after a shift by a pixel one way than the other, in
     standard deviations."""
     ahead, behind = (np.abs(rows[1:, side] - rows[:-1, 1:-1]) for side in (slice(2, None), slice(-2)))
-    better = (behind - ahead) / np.maximum(behind + ahead, np.finfo(float).tiny)
-    jumps = better.mean(axis=1)
+    better = (behind - ahead) / np.maximum(behind + ahead, np.finfo(np.float32).tiny)
+    jumps = better.mean(axis=1, dtype=float)
     jumps -= median_filter(jumps, _AROUND)
     scaled = jumps / max(float(jumps.std()), np.finfo(float).tiny)
     return np.asarray(np.clip(scaled, -_MOST_SIGMAS, _MOST_SIGMAS))

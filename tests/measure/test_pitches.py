@@ -399,7 +399,7 @@ def test_of_a_large_scan_windows_are_read(bent_mm: float, tmp_path: Path, monkey
         monkeypatch.setattr("measure.fiducials.search._LARGE_PX", 1)
         result = measure_fiducials(scan, layout, LARGE_PITCH_UM)
     assert all(mark.status.is_observation for mark in result.marks)
-    assert len(read) * 64**2 < 0.4 * grey.size
+    assert len(read) * 64**2 < 0.45 * grey.size  # 0.3 of so small a scan are the strips that tell nearest neighbours
 
 
 def test_a_lattice_is_distinguished_from_a_frame() -> None:
