@@ -66,11 +66,11 @@ def test_no_folds(kind: Transformation, parameters: list[float], camera: list[li
 @pytest.mark.parametrize(
     ("spelling", "words"),
     [
-        ("helmert", ['no transformation "helmert"']),
+        ("helmert", ["no transformation 'helmert'"]),
         ("conformal", ["lacks its order", '"conformal(2)"']),
         ("polynomial(6)", ["order must be from 1 to 5"]),
         ("polynomial(0)", ["order must be from 1 to 5"]),
-        ("bilinear(2)", ['no transformation "bilinear(2)"']),
+        ("bilinear(2)", ["no transformation 'bilinear(2)'"]),
     ],
 )
 def test_a_wrong_spelling_is_reported_what_is_possible(spelling: str, words: list[str]) -> None:
