@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from measure.flags import Cause, Code, Reason, Status
-from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
 from pipeline.archive.checked_results import CheckedResult, judge
 from pipeline.archive.made_from import measured_from
 from pipeline.archive.results_database import Kept, Store
@@ -61,7 +61,7 @@ def stand_in(task: ScanTask) -> MeasuredFile:
     marks = tuple(_mark(str(number), xy, matrix, rng) for number, xy in enumerate(FIDUCIALS, 1))
     weak = int(os.environ.get("RESEAU_STAND_IN_WEAK", "0"))
     marks = tuple(replace(one, status=Status.WEAK, reason=_COVERED) if k < weak else one for k, one in enumerate(marks))
-    pose = Pose("0", True, ("set in the project.",))
+    pose = ScanOrientation("0", True, ("set in the project.",))
     frame = FrameMeasurement(task.name, marks, pose, matrix)
     scan = MeasuredScan(task.scan, 11500, 11500, (_PITCH_UM, _PITCH_UM), frame, ("It is a stand-in.",))
     return MeasuredFile(replace(scan, seconds=0.5), digest.hex(), len(digest))

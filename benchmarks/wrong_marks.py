@@ -16,7 +16,7 @@ from test_across_frames import FOUR, PX_PER_MM, make_layout
 from benchmarks.harness import Row
 from measure.fiducials.across_frames import check_frames
 from measure.flags import Status
-from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
 
 Array = NDArray[np.float64]
 SIGMA_PX, OFF_MM = 0.03, 1.0
@@ -89,4 +89,4 @@ def bent_frame(rng: np.random.Generator, name: str, bend: str, bend_mm: float, a
         for k, center in enumerate(centers)
     )
     matrix = np.column_stack([pixel_from_film @ linear, [6000.0, 6000.0]])
-    return FrameMeasurement(name, marks, Pose("0", True), matrix)
+    return FrameMeasurement(name, marks, ScanOrientation("0", True), matrix)

@@ -29,7 +29,7 @@ from .matching.window import read_window as read_window
 from .results import FrameMeasurement as FrameMeasurement
 from .results import MarkFit as MarkFit
 from .results import MarkMeasurement as MarkMeasurement
-from .results import Pose as Pose
+from .results import ScanOrientation as ScanOrientation
 from .scans.opening import open_scan as open_scan
 from .scans.scan import Scan as Scan
 from .targets.identification import TargetOptions as TargetOptions

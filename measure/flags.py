@@ -173,27 +173,27 @@ def _limit(value: float, of: str, decides: str) -> float:
 
 
 # The search for a frame.
-FRAMES_BY_CHANCE = _limit(
+MAX_FALSE_FRAMES = _limit(
     0.01,
     "expected number of false frames, over all attempts so far, or over those at its pitch",
     "a frame found under another pitch, or by the search for faint marks, is rejected",
 )
-PLACEMENTS_BY_CHANCE = _limit(
+MAX_FALSE_PLACEMENTS = _limit(
     30.0,
     "expected number of false placements with as high a score, before the marks are matched",
     "no frame is measured there",
 )
-FRAME_BY_CHANCE = _limit(
+FRAME_DOUBT_P = _limit(
     0.05,
     "p-value of the frame, where only some of its marks are found",
     "its marks are weak, its scan orientation assumed",
 )
-NO_FRAME = _limit(  # likelier than not
+FRAME_REJECTED_P = _limit(  # likelier than not
     0.5,
     "p-value of the frame, where only some of its marks are found",
     "none of its marks is an observation: they are predicted",
 )
-CAMERA_BY_CHANCE = _limit(
+MAX_FALSE_CAMERAS = _limit(
     0.01,
     "expected number of false constellations with as high a score",
     "a camera is not named unless its marks correlate half as well at wrong places",

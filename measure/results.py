@@ -117,7 +117,7 @@ class MarkMeasurement:
 
 
 @dataclass(frozen=True)
-class Pose:
+class ScanOrientation:
     """Scan orientation: counter-clockwise turn in degrees, followed by "m" if mirrored.
 
     In orientation "90m" the camera frame (x' right, y' up) is first mirrored (x' to -x'), then turned by 90 degrees
@@ -167,7 +167,7 @@ class FrameMeasurement:
 
     image: str
     marks: tuple[MarkMeasurement, ...]
-    pose: Pose | None = None
+    pose: ScanOrientation | None = None
     pixel_from_camera: Array | None = None
     problems: tuple[Reason, ...] = ()
     weights: tuple[float, ...] | None = None

@@ -226,7 +226,7 @@ class _Run:
         adjustment = adjust_marks(project, marks)
         if not scans:
             return adjustment
-        from pipeline.adjusting.second_visit import measure_again
+        from pipeline.adjusting.second_pass import measure_again
         from pipeline.archive.measure_archive import open_executor
 
         again = measure_again(project, scans, adjustment, self.reporter, lambda: open_executor(project, self.work))

@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from measure.flags import Status
-from measure.results import Pose
+from measure.results import ScanOrientation
 from pipeline.archive.status import NAMED, ArchiveStatus, archive_status, worst_named
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_counts
 from pipeline.files.project_file import Project
@@ -57,7 +57,7 @@ class Summary:
 
     verdict: ReportVerdict
     frames: Mapping[str, Mapping[str, int]]
-    poses: Mapping[str, Pose]
+    poses: Mapping[str, ScanOrientation]
     adjustment: AdjustmentRecord | None
     check: Check | None
     files: Mapping[str, Path] = field(default_factory=dict)

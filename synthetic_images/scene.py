@@ -236,7 +236,7 @@ class SceneImage:
     Attributes
     ----------
     exterior : X0, Y0, Z0 in object units, omega, phi, kappa in rad.
-    pose : scan orientation as in `measure.results.Pose`.
+    pose : scan orientation as in `measure.results.ScanOrientation`.
     turn_rad : small rotation in addition to the pose.
     offset_mm : of the frame's centre from the scan's centre.
     covered : fiducials under a piece of tape.

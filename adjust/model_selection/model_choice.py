@@ -32,9 +32,9 @@ from adjust.model_selection.scanner_choice import choose_bends, network_with_ter
 from adjust.problem.network import Approximations, Network, Transformation
 from adjust.problem.observations import Calibration
 from adjust.problem.parameter import Parameter, description, object_coordinate
+from adjust.quality.critical_values import NO_WEIGHT
 from adjust.quality.run import UNCHECKED
 from adjust.quality.significance import LEVEL, f_probability
-from adjust.quality.tested import NO_WEIGHT
 from adjust.rank_defect.datum import held_as_known
 from adjust.solution.adjustment import Options, adjust
 from adjust.solution.result import Adjustment

@@ -20,8 +20,8 @@ from adjust.array_types import Array, Indices, Mask
 from adjust.linear_algebra.small_matrices import applied, eigen, product
 from adjust.problem.estimates import VarianceFactor
 from adjust.problem.parameter import Parameter
+from adjust.quality.critical_values import Probabilities, Tested, robust_scale
 from adjust.quality.run import UNCHECKED, GrossError, Run, surplus
-from adjust.quality.tested import Probabilities, Tested, robust_scale
 
 UNCONTROLLED = 1e-4  # redundancy number below which only errors of hundreds of standard deviations are detectable
 TOLD_APART = 7.0  # difference of two statistics that decides between explanations: odds of 30 to 1

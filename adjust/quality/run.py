@@ -21,7 +21,7 @@ from adjust.linear_algebra.small_matrices import applied, eigen, inverse, laid_o
 from adjust.problem.estimates import NullDirection
 from adjust.problem.further_observations import square_sum
 from adjust.problem.problem import ABSENT, Problem, State
-from adjust.quality.tested import TestedUnits, Weighting
+from adjust.quality.critical_values import TestedUnits, Weighting
 from adjust.rank_defect.diagnosis import pseudo_square_sum
 
 UNCHECKED = 1e-9  # redundancy below which an observation is unchecked

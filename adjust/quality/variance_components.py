@@ -17,8 +17,8 @@ from adjust.array_types import Array, Indices, Mask
 from adjust.least_squares.equations import prior_differences
 from adjust.problem.estimates import GivenGroup, VarianceFactor
 from adjust.problem.problem import ABSENT, Problem
+from adjust.quality.critical_values import Weighting
 from adjust.quality.run import Run
-from adjust.quality.tested import Weighting
 
 UNCHECKED = 0.01  # redundancy below which given values only place something
 LEAST_REDUNDANCY = 1.0  # of the observations that determine sigma0

@@ -33,9 +33,9 @@ from scipy.special import chdtr, chdtrc, fdtrc, ndtr
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.problem.problem import Problem
+from adjust.quality.critical_values import Probabilities
 from adjust.quality.reliability import TOLD_APART, Snooping
 from adjust.quality.run import UM_PER_MM, GrossError, Run, residuals
-from adjust.quality.tested import Probabilities
 from adjust.quality.variance_components import added_variance, refined_factors
 from adjust.rank_defect.diagnosis import singular_directions
 from adjust.solution.model_hypotheses import ModelHypothesis, estimate, model_hypotheses, separate_lenses

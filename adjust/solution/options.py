@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
-from adjust.quality.tested import PRIOR_GROUPS, Probabilities, WeightFunction
+from adjust.quality.critical_values import PRIOR_GROUPS, Probabilities, WeightFunction
 
 Datum = Literal["control", "minimal", "free"]
 Method = Literal["combined", "elements"]

@@ -32,6 +32,7 @@ from adjust.quality.cofactor import (
     larger_covariance,
     prediction_errors,
 )
+from adjust.quality.critical_values import Probabilities
 from adjust.quality.lens_uncertainty import (
     LensReach,
     ProjectionUncertainty,
@@ -49,7 +50,6 @@ from adjust.quality.significance import (
     correlations,
     significance_tests,
 )
-from adjust.quality.tested import Probabilities
 from adjust.quality.variance_components import factor_sigmas, variance_factor
 from adjust.rank_defect.datum import (
     CENTERINGS,

@@ -14,9 +14,9 @@ from adjust.problem.condition_equations import blind_marks
 from adjust.problem.estimates import NullDirection, Termination
 from adjust.problem.problem import Problem, State
 from adjust.quality.cofactor import free_cofactor
+from adjust.quality.critical_values import NO_WEIGHT, TestedUnits, WeightFunction, Weighting, robust_weights
 from adjust.quality.reliability import Snooping
 from adjust.quality.run import GrossError, Run
-from adjust.quality.tested import NO_WEIGHT, TestedUnits, WeightFunction, Weighting, robust_weights
 from adjust.quality.variance_components import refined_factors
 from adjust.rank_defect.diagnosis import REACHES, edge_motions, is_contradicted, singular_directions, unresolved
 from adjust.solution.options import Options

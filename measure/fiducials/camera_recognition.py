@@ -18,7 +18,7 @@ from measure.fiducials.measure_frame import detect_frame
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import FrameSearch, PitchHypothesis
 from measure.fiducials.significance import false_placements
-from measure.flags import CAMERA_BY_CHANCE, CAMERA_BY_NOISE
+from measure.flags import CAMERA_BY_NOISE, MAX_FALSE_CAMERAS
 from measure.marks.shapes import FiducialLayout
 from measure.matching.models import MatchOptions
 from measure.scans.scan import Scan
@@ -61,7 +61,7 @@ def recognise_frame(scan: Scan, layout: FiducialLayout, answered: Answer, times:
     """
     for placement in answered.placements[:_PLACES]:
         enlarged = _enlarged(placement, times)
-        if answered.expected <= CAMERA_BY_CHANCE or _may_be_there(scan, layout, enlarged):
+        if answered.expected <= MAX_FALSE_CAMERAS or _may_be_there(scan, layout, enlarged):
             # All marks count in the score: without the missing ones, a camera of eight loses to one that has four.
             frame = detect_frame(scan, layout, enlarged, _QUICK_OPTIONS)
             if frame.accepted:

@@ -13,7 +13,7 @@ from measure.fiducials.options import CLICK_SIGMA_PX, Click, FiducialOptions
 from measure.flags import NO_REASON, Cause, Code, Reason, Status
 from measure.geometry import POSES, UP_FROM_CAMERA, linear_scale
 from measure.marks.shapes import FiducialLayout
-from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
 from measure.scans.scan import Scan
 
 LEAST_CLICKS = 3  # two do not determine whether the frame is mirrored
@@ -28,7 +28,7 @@ def is_shown(layout: FiducialLayout, options: FiducialOptions) -> bool:
 
 def clicked_frame(
     scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
-) -> tuple[Frame, Pose]:
+) -> tuple[Frame, ScanOrientation]:
     """Measure the frame from a similarity through the clicked marks.
 
     Returns the frame and its scan orientation, which is decided if the project sets it or the clicked marks are not
@@ -52,7 +52,7 @@ def clicked_frame(
     frame = max(frames, key=lambda one: (one.measured_count, int(one.inliers.sum())))
     tells = options.pose != "auto" or not are_collinear(camera)
     evidence = _TOLD if tells else ("the marks that were pointed at lie on a line, which has two sides.",)
-    return frame, Pose(pose, tells, evidence)
+    return frame, ScanOrientation(pose, tells, evidence)
 
 
 def contradicted_pose(layout: FiducialLayout, options: FiducialOptions, pitch_um: tuple[float, float] | None) -> Reason:

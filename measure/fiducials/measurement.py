@@ -19,10 +19,10 @@ from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import SearchResult
 from measure.fiducials.significance import doubt_frame, false_placements
 from measure.fiducials.stages import find_frame
-from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Code, Reason, Status
+from measure.flags import MAX_FALSE_FRAMES, NO_REASON, Code, Reason, Status
 from measure.geometry import UP_FROM_CAMERA
 from measure.marks.shapes import FiducialLayout, limit_to_crossings, limit_to_frame
-from measure.results import FrameMeasurement, Pose
+from measure.results import FrameMeasurement, ScanOrientation
 from measure.scans.opening import crop_scan
 from measure.scans.remote import Window
 from measure.scans.scan import Scan
@@ -95,7 +95,7 @@ def _search_frame(
         return replace(absent, writing=_read(scan, layout, None)) if options.writing == "all" else absent
     is_faint = frame.is_faint
     lines = _read(scan, layout, frame) if options.writing == "all" else None
-    pose, against = Pose(options.pose, True, _SET), NO_REASON
+    pose, against = ScanOrientation(options.pose, True, _SET), NO_REASON
     if options.pose == "auto":
         pose = decide_pose(frame, lines or ())
         if options.writing == "pose" and not pose.decided and frame.accepted:
@@ -115,7 +115,7 @@ def _search_frame(
     return replace(present_frame(frame, pose, pitch_um, problems, _FAINT if is_faint else chance), writing=lines)
 
 
-def _rename(frame: Frame, pose: Pose) -> tuple[Frame, Pose]:
+def _rename(frame: Frame, pose: ScanOrientation) -> tuple[Frame, ScanOrientation]:
     """Rename the marks to those of a pose. If fewer of them agree then, keep the frame, its pose only assumed."""
     if pose.name == frame.placement.pose:
         return frame, pose
@@ -214,7 +214,7 @@ def _is_another_frame(result: SearchResult, other: Placement, frame: Frame) -> b
     """Whether a placement with as many supporting marks is another frame, as in a scan of two photographs."""
     if other.supported < frame.placement.supported or not result.is_exhaustive(other):
         return False
-    if false_placements(result, other) > FRAMES_BY_CHANCE:
+    if false_placements(result, other) > MAX_FALSE_FRAMES:
         return False
     frame_there = measure_frame(frame.scan, frame.layout, other, frame.options)
     return frame_there.is_sure and not frame.contains(frame_there)

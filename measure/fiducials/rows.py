@@ -14,7 +14,7 @@ from measure.flags import NO_REASON, RIGHT_PITCH_REFUSED, Cause, Code, Reason, S
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkTemplate, finest_detail_mm
 from measure.matching.covariance import honest_covariance
 from measure.noise.resampling import NEAREST_PX2, is_nearest_neighbour
-from measure.results import FrameMeasurement, MarkMeasurement, Pose
+from measure.results import FrameMeasurement, MarkMeasurement, ScanOrientation
 from measure.scans.scan import Scan
 
 _LEAST_MARKS = 3  # with two, a false one yields a wrong pitch
@@ -80,7 +80,11 @@ def _too_coarse(layout: FiducialLayout, pitch_um: float) -> Reason:
 
 
 def present_frame(
-    frame: Frame, pose: Pose, pitch_um: tuple[float, float] | None, problems: Sequence[Reason], chance: Reason
+    frame: Frame,
+    pose: ScanOrientation,
+    pitch_um: tuple[float, float] | None,
+    problems: Sequence[Reason],
+    chance: Reason,
 ) -> FrameMeasurement:
     """Return the result for a frame that was found.
 
@@ -148,9 +152,10 @@ def _stretch(scan: Scan, wide_um: float, tall_um: float, pitch_um: tuple[float, 
     )
 
 
-def _row(mark: LayoutMark, index: int, frame: Frame, pose: Pose, weak: Reason, unnamed: Reason) -> MarkMeasurement:
-    """Row of a mark. weak, unnamed: why no mark of the frame counts as measured, or as an observation; empty if they
-    may."""
+def _row(
+    mark: LayoutMark, index: int, frame: Frame, pose: ScanOrientation, weak_reason: Reason, ambiguity: Reason
+) -> MarkMeasurement:
+    """Row of a mark. weak_reason: why no mark of the frame is measured; ambiguity: why none is an observation."""
     detection = frame.detections[index]
     fit = detection.fit
     if fit is None:
@@ -165,13 +170,13 @@ def _row(mark: LayoutMark, index: int, frame: Frame, pose: Pose, weak: Reason, u
     if isinstance(mark.mark, MarkTemplate):
         covariance = honest_covariance(mark.mark, name, fit)
         if set(mark.mark.shares) == {name}:
-            weak = _OWN
+            weak_reason = _OWN
         elif mark.mark.learned_mm and not pose.is_unambiguous_up_to(mark.mark.alike):
-            weak = _ASSUMED  # under another name its origin lies elsewhere
-    if status is Status.MEASURED and weak:
-        status, reason = Status.WEAK, weak
-    if status.is_observation and unnamed:
-        status, reason = Status.REJECTED, unnamed
+            weak_reason = _ASSUMED  # under another name its origin lies elsewhere
+    if status is Status.MEASURED and weak_reason:
+        status, reason = Status.WEAK, weak_reason
+    if status.is_observation and ambiguity:
+        status, reason = Status.REJECTED, ambiguity
     return MarkMeasurement(mark.id, "fiducial", fit.center_px, covariance, status, reason, {**quality, **fit.figures})
 
 

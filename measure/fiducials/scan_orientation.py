@@ -34,7 +34,7 @@ from measure.marks.shapes import (
     WrittenPlace,
 )
 from measure.noise.robust_estimation import TukeyFit, robust_scale, tukey_fit
-from measure.results import MarkFit, Pose
+from measure.results import MarkFit, ScanOrientation
 from measure.scans.parallel import map_in_threads
 from measure.scans.scan import Scan, means
 
@@ -105,7 +105,7 @@ class _Hypothesis:
         return self.likelihood + (0.0 if self.pose.endswith("m") else _UNMIRRORED)
 
 
-def decide_pose(frame: Frame, lines: Sequence[Line] = (), poses: Sequence[str] = POSES) -> Pose:
+def decide_pose(frame: Frame, lines: Sequence[Line] = (), poses: Sequence[str] = POSES) -> ScanOrientation:
     """Decide the scan orientation of a measured frame.
 
     Parameters
@@ -184,10 +184,10 @@ def _given_sigma_mm(mark: LayoutMark) -> float:
 
 def _decision(
     hypotheses: Sequence[_Hypothesis], layout: FiducialLayout, found: int, lines: Sequence[Line] = ()
-) -> Pose:
+) -> ScanOrientation:
     """Select the most likely orientation, with the evidence in sentences. found: number of marks found."""
     if not hypotheses:
-        return Pose("0", False, ("no scan orientation names the marks that were found.",))
+        return ScanOrientation("0", False, ("no scan orientation names the marks that were found.",))
     best_likelihood = max(each.likelihood for each in hypotheses)
     alike = [each for each in hypotheses if best_likelihood - each.likelihood < DECIDED]
     best = max(alike, key=lambda each: each.total)
@@ -196,7 +196,7 @@ def _decision(
     written, main = {each.pose: each.writing for each in hypotheses} if lines else {}, main_pose(lines)
     if len(alike) == 1:
         reasons = against or (f"no other scan orientation explains the {found} marks found.",)
-        return Pose(best.pose, True, reasons, written, main)
+        return ScanOrientation(best.pose, True, reasons, written, main)
     first, lead = alike[0].pose, best.total - alike[0].total
     near = [each.pose for each in alike if best.total - each.total < TOLD]
     # Among equal ones: that in which most of the writing is upright, so that the frames of a roll agree.
@@ -217,7 +217,7 @@ def _decision(
             f"coordinates are alike; {chosen}."
         )
     rivals = tuple(pose_in_camera(each.pose, assumed) for each in alike if each.pose != assumed)
-    return Pose(assumed, False, (sentence, *against), written, main, rivals=rivals)
+    return ScanOrientation(assumed, False, (sentence, *against), written, main, rivals=rivals)
 
 
 def _against(best: _Hypothesis, rival: _Hypothesis, layout: FiducialLayout, lines: Sequence[Line]) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from measure.detection.localisation import highest_peak
 from measure.fiducials.constellation import NARROW, Placement
 from measure.fiducials.frame import REDUCED_PX, Frame
 from measure.fiducials.search import SearchResult
-from measure.flags import FRAME_BY_CHANCE, NO_FRAME, NO_REASON, Code, Reason
+from measure.flags import FRAME_DOUBT_P, FRAME_REJECTED_P, NO_REASON, Code, Reason
 
 _CRITERIA = 3  # by which a false frame may be as good: response heights, misfit, and misfit under a stretch
 _STRETCHES = np.linspace(-0.03, 0.03, 13)  # relative, of non-square pixels; a step moves marks within narrow bounds
@@ -148,7 +148,7 @@ def doubt_frame(result: SearchResult, frame: Frame) -> Reason:
     if len(clear) <= _FREE or not result.is_exhaustive(frame.placement):
         return NO_REASON
     expected = false_frames(result, frame, clear)
-    if expected <= FRAME_BY_CHANCE:
+    if expected <= FRAME_DOUBT_P:
         return NO_REASON
     return Reason(
         f"so many places of the scan match the {len(clear)} marks found that {expected:.2g} such false alarms are "
@@ -166,13 +166,13 @@ def _doubt_by_neighbourhood(frame: Frame, inside: Sequence[int], clear: Sequence
     matches, places = random_matches(frame, clear)
     hits = max(matches.values(), default=places)
     chance = float(bdtrc(found - _FREE - 1, len(inside) - _FREE, _share(hits, places)))
-    if chance <= FRAME_BY_CHANCE:
+    if chance <= FRAME_DOUBT_P:
         return NO_REASON
     unmatched = sum(each == 0 for each in matches.values())
     return Reason(
         f"only {found} of {len(inside)} marks were found, and {hits} of {places} random places match "
         f"as well (p = {chance:.2f}): the frame may lie elsewhere",
-        *((Code.CHANCE, Code.NO_FRAME) if chance > NO_FRAME or unmatched < frame.least else (Code.CHANCE,)),
+        *((Code.CHANCE, Code.NO_FRAME) if chance > FRAME_REJECTED_P or unmatched < frame.least else (Code.CHANCE,)),
     )
 
 

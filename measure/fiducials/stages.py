@@ -28,7 +28,7 @@ from measure.fiducials.search import (
     slightly_longer,
 )
 from measure.fiducials.significance import doubt_frame, false_frames, false_placements
-from measure.flags import FRAMES_BY_CHANCE, PLACEMENTS_BY_CHANCE, Code, Reason
+from measure.flags import MAX_FALSE_FRAMES, MAX_FALSE_PLACEMENTS, Code, Reason
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
 from measure.tone.curve import Tone
@@ -155,7 +155,7 @@ def find_frame(
         start = scan if stage.tone is None else scan.replace_tone(stage.tone)
         frames = measure_stage(start, layout, stage, result, tried)
         expected, frame = frames[0] if frames else (np.inf, None)
-        if expected <= FRAMES_BY_CHANCE:
+        if expected <= MAX_FALSE_FRAMES:
             found = replace(found, result=result, frame=frame, is_taken=True)
         elif stage.is_given:
             if stage.tone is None or (frame is not None and frame.is_nearer_than(found.frame)):
@@ -193,7 +193,7 @@ def measure_stage(
     places = _places_to_try(found[:1] if kind in ("middle", "oblique") else found)
     if kind in ("pitch", "faint"):
         number = tried if kind == "faint" else len(stage.hypotheses)
-        places = [each for each in places if number * false_placements(result, each) <= PLACEMENTS_BY_CHANCE]
+        places = [each for each in places if number * false_placements(result, each) <= MAX_FALSE_PLACEMENTS]
     if kind == "pitch" or stage.tone is not None:
         places = [each for each in places if shows_marks(scan, layout, each, options)]
     least = _OBLIQUE, _GAINED - 1  # marks in all, and missing ones, for a perspective
@@ -253,7 +253,7 @@ def _evaluate(frame: Frame, result: SearchResult, tried: int) -> Evaluated | Non
 
 def _is_taken_if_given(evaluated: Evaluated, at_given: float) -> bool:
     """Whether a frame would be taken if its pitch were given. at_given: share of the hypotheses under the given one."""
-    return evaluated[1].accepted or evaluated[0] * at_given <= FRAMES_BY_CHANCE
+    return evaluated[1].accepted or evaluated[0] * at_given <= MAX_FALSE_FRAMES
 
 
 def _places_to_try(found: Sequence[Placement]) -> list[Placement]:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, get_args
 from adjust.functional_model.scanner import is_term
 from adjust.functional_model.transformation import FILM_NAMES, film_kind
 from adjust.problem.network import Transformation
-from adjust.quality.tested import PRIOR_GROUPS, WeightFunction
+from adjust.quality.critical_values import PRIOR_GROUPS, WeightFunction
 from adjust.solution.options import MEASURED_KINDS
 from measure.fiducials.options import Reads
 from measure.geometry import POSES

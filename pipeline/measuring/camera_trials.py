@@ -15,7 +15,7 @@ from measure.fiducials.camera_recognition import Answer, likeness, recognise_fra
 from measure.fiducials.frame import Frame
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import Hypotheses, PitchHypothesis, longer, pitch_hypotheses
-from measure.flags import CAMERA_BY_CHANCE
+from measure.flags import MAX_FALSE_CAMERAS
 from measure.geometry import linear_scale
 from measure.marks.shapes import FiducialLayout, LayoutMark, finest_detail_mm, limit_to_frame
 from measure.scans.opening import open_scan, thumbnail
@@ -293,11 +293,11 @@ def _attempts(
     """Yield tries of likely layouts, then of all at the given pitch, with non-square pixels and at any pitch; with the
     largest expected number of false alarms for which one of them ends the search."""
     if likely and pitch_um is None:
-        yield _any_pitch_tries(search, likely, count), CAMERA_BY_CHANCE
+        yield _any_pitch_tries(search, likely, count), MAX_FALSE_CAMERAS
     if pitch_um is not None:
-        for some, most in ((likely, CAMERA_BY_CHANCE), (layouts, np.inf)):
+        for some, most in ((likely, MAX_FALSE_CAMERAS), (layouts, np.inf)):
             given = _each(some, partial(search.try_pitch, pitch_um=pitch_um), count)
-            if any(each.answer.expected <= CAMERA_BY_CHANCE for each in given.values()):
+            if any(each.answer.expected <= MAX_FALSE_CAMERAS for each in given.values()):
                 yield given, most
         longer = _each(layouts, partial(search.longer_one_way, pitch_um=pitch_um), count)
         pairs = {names: (each, longer[names]) for names, each in given.items()}
@@ -350,7 +350,7 @@ def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) ->
 def _expected_at_most(seen: Trial, marks: int) -> float:
     """Limit on the expected false alarms of a layout with so many marks, given a trial that stands out."""
     # Fewer marks may be a part of those found: nine crosses of a larger réseau match a layout of nine.
-    most = CAMERA_BY_CHANCE if seen.expected <= CAMERA_BY_CHANCE else _BY_CHANCE
+    most = MAX_FALSE_CAMERAS if seen.expected <= MAX_FALSE_CAMERAS else _BY_CHANCE
     return min(most, _ODDS * seen.expected) if seen.found > marks else most
 
 
@@ -383,7 +383,7 @@ def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Tri
         likeness=float(np.mean([fit.likeness for fit in fits])) if fits else 0.0,
         snr=float(np.median([fit.snr for fit in fits])) if fits else 0.0,
         score=score,
-        chance=_score_by_chance(search, each) if score > close and expected > CAMERA_BY_CHANCE else None,
+        chance=_score_by_chance(search, each) if score > close and expected > MAX_FALSE_CAMERAS else None,
         residual_sigmas=None if residual is None else residual[0],
         residual_mm=None if residual is None else residual[1],
         reason="" if frame else reason,

@@ -15,7 +15,7 @@ from measure.fiducials.scan_orientation import DECIDED, TOLD, bounded, line_scor
 from measure.flags import Code, Reason, Status
 from measure.geometry import POSES, UP_FROM_CAMERA, pose_in_camera
 from measure.marks.shapes import WrittenPlace
-from measure.results import FrameMeasurement, Pose
+from measure.results import FrameMeasurement, ScanOrientation
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.scan_task import Measure, ScanOptions, ScanTask, sample_names
 from pipeline.progress import Reporter
@@ -121,7 +121,7 @@ def _known_line(frame: FrameMeasurement, line: Line) -> KnownLine | None:
     return KnownLine(line.text, line.pose, line.side, tuple((float(x), float(y)) for x, y in outline_mm))
 
 
-def poses_of_roll(scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace]) -> Mapping[str, Pose]:
+def poses_of_roll(scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace]) -> Mapping[str, ScanOrientation]:
     """Scan orientations, by image, that change when all frames of one camera are considered together.
 
     scans: of one camera, with scan orientations that nobody has set.
@@ -141,7 +141,7 @@ def poses_of_roll(scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace])
 def _writing_likelihoods(frames: Sequence[FrameMeasurement], places: Sequence[WrittenPlace]) -> Mapping[str, float]:
     """Log-likelihoods of the directions of text in the camera's frame, 0 for the best."""
     # Text that recurs on several frames, except for its digits, is one title or one stamp and counts once.
-    texts: dict[str, tuple[Pose, Line]] = {}
+    texts: dict[str, tuple[ScanOrientation, Line]] = {}
     for frame in frames:
         assert frame.pose is not None
         for line in frame.writing or ():
@@ -152,7 +152,7 @@ def _writing_likelihoods(frames: Sequence[FrameMeasurement], places: Sequence[Wr
     return dict(zip(_TURNS, (likelihoods - likelihoods.max()).tolist(), strict=True))
 
 
-def _together(frame: FrameMeasurement, turn: str, told: bool, frames: int) -> Pose:
+def _together(frame: FrameMeasurement, turn: str, told: bool, frames: int) -> ScanOrientation:
     """Scan orientation of a frame with text in this direction. told: whether the frames together determine it."""
     assert frame.pose is not None
     pose = replace(frame.pose, name=_scan_pose(frame.pose, turn))
@@ -165,7 +165,7 @@ def _together(frame: FrameMeasurement, turn: str, told: bool, frames: int) -> Po
     return replace(pose, decided=True, evidence=(together, *pose.evidence[1:]))
 
 
-def _face_is_known(pose: Pose) -> bool:
+def _face_is_known(pose: ScanOrientation) -> bool:
     """Whether the frame alone determines if its scan is mirrored."""
     faces = [
         max((value for name, value in pose.written.items() if name.endswith("m") == mirrored), default=0.0)
@@ -180,12 +180,12 @@ def _is_doubted(frame: FrameMeasurement) -> bool:
     return not any(mark.status == Status.MEASURED for mark in frame.marks) or any(p in evidence for p in frame.problems)
 
 
-def _turn(pose: Pose) -> str:
+def _turn(pose: ScanOrientation) -> str:
     """Direction of the text in the camera's frame, if the frame has this scan orientation."""
     return pose_in_camera(pose.writing, pose.name)
 
 
-def _scan_pose(pose: Pose, turn: str) -> str:
+def _scan_pose(pose: ScanOrientation, turn: str) -> str:
     """Scan orientation of a frame whose text has this direction in the camera's frame."""
     return next(name for name in POSES if pose_in_camera(pose.writing, name) == turn)
 

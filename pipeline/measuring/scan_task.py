@@ -11,7 +11,7 @@ from adjust.functional_model.lens import Distortion, Prior
 from adjust.problem.network import Exterior
 from measure.errors import MissingError
 from measure.fiducials.options import FiducialOptions
-from measure.results import Pose
+from measure.results import ScanOrientation
 from measure.scans.remote import fetch_location, public_address, scan_path
 from measure.tone.curve import ToneInformation
 from pipeline.files.camera_file import CameraFile
@@ -53,7 +53,7 @@ class ScanOptions:
     camera: CameraFile
     pitch_um: tuple[float, float] | None
     fiducials: FiducialOptions
-    known_pose: Pose | None = None
+    known_pose: ScanOrientation | None = None
     tone: float | str = "auto"
     tone_information: tuple[ToneInformation, ...] = ()
     targets: "SoughtTargets | None" = None
@@ -176,16 +176,16 @@ def sample_names(names: Sequence[str], count: int) -> list[str]:
     return [name for name in names if name in chosen]
 
 
-def _pose(project: Project, camera: CameraFile, name: str) -> tuple[str, Pose | None]:
+def _pose(project: Project, camera: CameraFile, name: str) -> tuple[str, ScanOrientation | None]:
     """Scan orientation of an image: as set in the project, or known from the learning of marks."""
     # Marks that recur in all scans, without clicks, were searched in one assumed orientation.
     learned = camera.learned_from
     if learned is None or project.pose != "auto" or name not in learned.alike:
         return project.pose, None
     if learned.clicked:
-        return learned.pose, Pose(learned.pose, True, ("the clicks in it say so.",))
+        return learned.pose, ScanOrientation(learned.pose, True, ("the clicks in it say so.",))
     like = f"it is taken to lie as {learned.scan}, from which its marks were learned: {learned.pose} is assumed."
-    return learned.pose, Pose(learned.pose, False, (like,))
+    return learned.pose, ScanOrientation(learned.pose, False, (like,))
 
 
 def _sought(project: Project, camera: CameraFile) -> CameraFile:

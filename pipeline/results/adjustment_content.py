@@ -16,10 +16,10 @@ from adjust.problem.camera import Camera
 from adjust.problem.estimates import adjusted_image, observed_places
 from adjust.problem.network import EXTERIOR_NAMES, Image, ObjectPoint
 from adjust.problem.parameter import Kind, Parameter
+from adjust.quality.critical_values import Tested
 from adjust.quality.lens_uncertainty import projection_uncertainty
 from adjust.quality.reliability import Reliability, Suspect
 from adjust.quality.significance import CalibrationTest, SignificanceTest
-from adjust.quality.tested import Tested
 from adjust.solution.result import Adjustment
 from pipeline.results.adjustment_record import (
     AdjustmentRecord,

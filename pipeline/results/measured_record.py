@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 
 from measure.annotations.lines import Field, Line, find_fields
 from measure.flags import Cause, MeaningfulWord, Reason, Status
-from measure.results import Covariance, FrameMeasurement, Kind, MarkMeasurement, Pose
+from measure.results import Covariance, FrameMeasurement, Kind, MarkMeasurement, ScanOrientation
 from measure.tone.curve import power, srgb
 from measure.tone.estimate import FrameTone
 from pipeline.text.csv_table import csv_line
@@ -28,7 +28,7 @@ MARK_COLUMNS = (
     "quality",
 )  # fmt: skip
 _KINDS: Mapping[str, Kind] = {kind: kind for kind in get_args(Kind)}
-_POSE, _LINES = TypeAdapter(Pose), TypeAdapter(tuple[Line, ...])
+_POSE, _LINES = TypeAdapter(ScanOrientation), TypeAdapter(tuple[Line, ...])
 
 
 class FailureCode(MeaningfulWord):
@@ -230,7 +230,7 @@ def _array(values: Any) -> Array:
     return np.array(values, dtype=np.float64)
 
 
-def pose_record(pose: Pose) -> dict[str, object]:
+def pose_record(pose: ScanOrientation) -> dict[str, object]:
     """Scan orientation (pose) with its evidence, as JSON."""
     record: dict[str, object] = plain_json(pose)
     return record

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from adjust import Adjustment, AdjustmentError, Camera, Distortion, Options, Prior, adjust
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
 from adjust.problem.network import Approximations, Exterior, Network, ObjectPoint
-from adjust.quality.tested import Probabilities
+from adjust.quality.critical_values import Probabilities
 
 AXES = ("Shift x", "Shift y", "Rotation", "Scale")
 DEFORMATIONS = ("Affinity", "Shear")

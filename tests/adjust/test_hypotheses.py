@@ -14,7 +14,7 @@ from studies import parametrize_with_studies
 
 from adjust import Adjustment, AdjustmentError, Distortion, Network, Observations, Options, Prior, adjust, approximate
 from adjust.functional_model.rotation import rotation_from_angles
-from adjust.quality.tested import Probabilities
+from adjust.quality.critical_values import Probabilities
 from adjust.solution.adjustment import adjust_unmodelled
 from adjust.solution.explanations import explain
 from adjust.solution.model_hypotheses import film_deformations

@@ -10,7 +10,7 @@ from adjust import Distortion, Options, Prior, adjust, approximate
 from adjust.model_selection import model_choice
 from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import Network, Transformation
-from adjust.quality.tested import WeightFunction
+from adjust.quality.critical_values import WeightFunction
 
 LENSES: dict[str, tuple[str, dict[str, float]]] = {
     "none": ("torlegard", {}),

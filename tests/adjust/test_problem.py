@@ -21,7 +21,7 @@ from adjust.problem.camera import FiducialDistance
 from adjust.problem.network import Board, Scanner
 from adjust.problem.observations import Distance
 from adjust.problem.parameter import object_coordinate, parameter_from_text, parameters_from_texts
-from adjust.quality.tested import Probabilities, WeightFunction
+from adjust.quality.critical_values import Probabilities, WeightFunction
 from adjust.solution.adjustment import Datum, Options
 
 Change = Callable[[Network], Network]

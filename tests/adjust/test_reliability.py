@@ -23,10 +23,10 @@ from adjust.problem.condition_equations import compute, derivatives
 from adjust.problem.estimates import GivenGroup, adjusted_image
 from adjust.problem.network import Approximations, Exterior, Network, ObjectPoint
 from adjust.problem.problem import State, number
+from adjust.quality.critical_values import Probabilities, robust_weights
 from adjust.quality.fiducial_corrections import common_transformation, corrections_to_given
 from adjust.quality.reliability import Reliability
 from adjust.quality.significance import SignificanceTest
-from adjust.quality.tested import Probabilities, robust_weights
 
 Array = NDArray[np.float64]
 

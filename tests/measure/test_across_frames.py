@@ -9,7 +9,17 @@ import pytest
 from drawn import center, measured_mark
 from studies import parametrize_with_studies
 
-from measure import Code, FiducialLayout, FrameMeasurement, LayoutMark, MarkShape, Pose, Reason, Status, cross
+from measure import (
+    Code,
+    FiducialLayout,
+    FrameMeasurement,
+    LayoutMark,
+    MarkShape,
+    Reason,
+    ScanOrientation,
+    Status,
+    cross,
+)
 from measure.fiducials.across_frames import CheckedFrames, check_frames
 from measure.fiducials.consistency import FrameMarks, frame_p_value
 from measure.fiducials.options import BelievedFilm
@@ -52,7 +62,7 @@ def make_frames(
         centers = made @ linear.T + matrix[:, 2] + rng.normal(0.0, scatter, made.shape) + bent
         places = zip(layout.marks, centers, strict=True)
         marks = tuple(measured_mark(mark.id, center, SIGMA_PX) for mark, center in places)
-        frames.append(FrameMeasurement(str(number), marks, Pose(pose, True), matrix))
+        frames.append(FrameMeasurement(str(number), marks, ScanOrientation(pose, True), matrix))
     return frames
 
 
@@ -246,7 +256,9 @@ def make_frame(name: str, film_mm: np.ndarray, rng: np.random.Generator) -> Fram
     up = np.diag([1.0, -1.0])
     centers = PX_PER_MM * film_mm @ up + 6000.0 + rng.normal(0.0, WRONG_MARKS_SIGMA_PX, film_mm.shape)
     marks = tuple(measured_mark(str(k), center, WRONG_MARKS_SIGMA_PX) for k, center in enumerate(centers))
-    return FrameMeasurement(name, marks, Pose("0", True), np.column_stack([PX_PER_MM * up, [6000.0, 6000.0]]))
+    return FrameMeasurement(
+        name, marks, ScanOrientation("0", True), np.column_stack([PX_PER_MM * up, [6000.0, 6000.0]])
+    )
 
 
 def bent_film(rng: np.random.Generator, bend_mm: float) -> np.ndarray:

@@ -23,11 +23,11 @@ from measure.fiducials.scan_orientation import SPOILT, MarkSite, PosedMark, deci
 from measure.fiducials.search import PitchHypothesis, SearchResult
 from measure.fiducials.significance import doubt_frame
 from measure.fiducials.stages import Found, Kind, Stage, find_frame
-from measure.flags import FRAMES_BY_CHANCE, NO_REASON, Code, Reason
+from measure.flags import MAX_FALSE_FRAMES, NO_REASON, Code, Reason
 from measure.geometry import POSES, UP_FROM_CAMERA
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross, dot
 from measure.marks.templates import cut, learn_template
-from measure.results import FrameMeasurement, Pose
+from measure.results import FrameMeasurement, ScanOrientation
 from measure.tone.curve import Tone
 from measure.tone.sharpening import Sharpening
 
@@ -325,7 +325,7 @@ def test_a_frame_that_chance_is_likelier_to_have_made_than_not_gives_no_observat
     frame = make_frame_chance(scan, DOTS)
     chance = doubt_frame(SearchResult(), frame)
     assert "(p = 1.00): the frame may lie elsewhere" in chance
-    result = present_frame(frame, Pose("0", False), (50.0, 50.0), (), chance)
+    result = present_frame(frame, ScanOrientation("0", False), (50.0, 50.0), (), chance)
     assert [mark.status for mark in result.marks] == [Status.PREDICTED] * 4
     assert all(mark.reason == chance and mark.covariance is None for mark in result.marks)
     for mark, place in zip(result.marks, centers_px(DOTS, "0"), strict=True):
@@ -338,7 +338,7 @@ def test_a_frame_whose_names_are_ambiguous_gives_no_observation() -> None:
     frame = make_frame_chance(make_scan(picture(DOTS, "0")), DOTS)
     shifted = Reason("the constellation fits nearly as well shifted", Code.AMBIGUOUS)
     for problems, status in (((), Status.MEASURED), ((shifted,), Status.REJECTED)):
-        result = present_frame(frame, Pose("0", False), (50.0, 50.0), problems, NO_REASON)
+        result = present_frame(frame, ScanOrientation("0", False), (50.0, 50.0), problems, NO_REASON)
         assert [mark.status for mark in result.marks] == [status] * 4
         for mark, place in zip(result.marks, centers_px(DOTS, "0"), strict=True):
             assert mark.center_px == pytest.approx(place, abs=0.1)
@@ -553,20 +553,20 @@ def name(found: Found) -> str:
 
 def test_each_attempt_is_tested_by_all_hypotheses_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
     """What would be taken by itself may be chance after so many others; its pitch is worth to be given then."""
-    found, checked = search_attempts(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 5)
+    found, checked = search_attempts(monkeypatch, np.inf, 1.0, MAX_FALSE_FRAMES / 5)
     assert checked == [2, 4, 6]
     assert name(found) == ""
     assert [cast(Stand, frame).name for frame in found.unsure] == ["2"]
     assert found.misfit.startswith("not 0; under another pitch 3 of them fit")
-    found, _ = search_attempts(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 7)
+    found, _ = search_attempts(monkeypatch, np.inf, 1.0, MAX_FALSE_FRAMES / 7)
     assert (name(found), found.is_taken) == ("2", True)
 
 
 def test_attempts_under_the_given_pitch_are_tested_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
-    found, checked = search_attempts(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 5, at_given=2)
+    found, checked = search_attempts(monkeypatch, np.inf, 1.0, MAX_FALSE_FRAMES / 5, at_given=2)
     assert checked == [2, 4, 4]
     assert name(found) == "2"
-    found, _ = search_attempts(monkeypatch, np.inf, 1.0, FRAMES_BY_CHANCE / 3, at_given=2)
+    found, _ = search_attempts(monkeypatch, np.inf, 1.0, MAX_FALSE_FRAMES / 3, at_given=2)
     assert (name(found), found.unsure) == ("", ())
     assert "3 faint marks fit, where 0.01 such false alarms are expected" in found.misfit
     assert "another pitch does not separate them; click the visible marks in `reseau review`" in found.misfit

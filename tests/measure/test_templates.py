@@ -20,7 +20,7 @@ from measure.marks.shapes import Bar, MarkShape, MarkTemplate, cross, polygon
 from measure.marks.templates import Chip, learn_template, share_origins
 from measure.matching.covariance import honest_covariance
 from measure.matching.match import MatchOptions, match
-from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
 
 Array = NDArray[np.float64]
 
@@ -243,7 +243,7 @@ def test_a_turn_is_compared_as_the_camera_has_it(poses: tuple[str, ...], agree: 
         quality = {"size_ratio": 1.0, "size_sigma": 0.002, "turn_rad": turn_rad, "turn_sigma": 0.002}
         place = Covariance({Cause.NOISE: 0.01 * np.eye(2)})
         mark = MarkMeasurement("1", "fiducial", np.zeros(2), place, Status.MEASURED, quality=quality)
-        frames.append(FrameMeasurement(pose, (mark,), Pose(pose, True)))
+        frames.append(FrameMeasurement(pose, (mark,), ScanOrientation(pose, True)))
     assert [frame.marks[0].status is Status.MEASURED for frame in check_own_figures(frames)] == [True, True, agree]
 
 
@@ -262,7 +262,7 @@ def make_frames(figures: Sequence[Mapping[str, float]], doubt: Reason) -> list[F
                 for name in "23"
             ),
         ]
-        frames.append(FrameMeasurement(str(number), tuple(marks), Pose("0", True)))
+        frames.append(FrameMeasurement(str(number), tuple(marks), ScanOrientation("0", True)))
     return frames
 
 

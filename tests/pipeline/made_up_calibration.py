@@ -17,10 +17,10 @@ from adjust import Adjustment, Camera, Distortion, Exterior, Image, Network, Obj
 from adjust.least_squares.iteration import Iteration
 from adjust.problem.estimates import NullDirection, VarianceFactor
 from adjust.problem.network import EXTERIOR_NAMES
+from adjust.quality.critical_values import Probabilities
 from adjust.quality.run import Group, Residuals
-from adjust.quality.tested import Probabilities
 from measure.flags import Cause, Reason, Status
-from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
 from pipeline import read_adjustment, write_adjustment
 from pipeline.report import ReportData, Thumbnail
 from pipeline.results.adjustment_file import read_covariance
@@ -247,7 +247,7 @@ def measured_report() -> ReportData:
 
 
 def _scan(image: str, marks: Sequence[MarkMeasurement]) -> MeasuredScan:
-    pose = Pose("0", True, ("The dots beside the corner marks say so (41 to 3).",))
+    pose = ScanOrientation("0", True, ("The dots beside the corner marks say so (41 to 3).",))
     place = np.array([[50.0, 0.0, 6000.0], [0.0, -50.0, 6000.0]])
     frame = FrameMeasurement(image, tuple(marks), pose, place)
     return MeasuredScan(f"scans/{image}.tif", 12000, 12000, (PITCH_UM, PITCH_UM), frame)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from adjust import Network, Prior
 from measure import FiducialLayout
 from measure.flags import Cause, Code, Reason, Status
-from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
 from pipeline.archive.checked_results import CheckedResult, find_judging, judge
 from pipeline.archive.results_database import Kept, Store
 from pipeline.cli import DONE, LOOK, run
@@ -250,7 +250,7 @@ def made_record(seed: int = 1, marks: int = 8, status: Status = Status.MEASURED,
     rng = random.Random(seed)
     matrix = np.array([[rng.uniform(40, 60), rng.gauss(0, 1), 2500.0], [rng.gauss(0, 1), -50.0, 2000.0]])
     own = tuple(mark(rng, str(number), status) for number in range(1, marks + 1))
-    frame = FrameMeasurement(str(seed), own, Pose("90m", True, ("its number says so.",)), matrix)
+    frame = FrameMeasurement(str(seed), own, ScanOrientation("90m", True, ("its number says so.",)), matrix)
     path, notes = str(FOLDER / f"scans/{seed}.tif"), ("Light was taken to grow as the grey value.",)
     return MeasuredScan(path, 5000, 4000, (20.0, 20.5), replace(frame, **changes), notes, seconds=0.5)
 

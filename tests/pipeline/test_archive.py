@@ -17,7 +17,7 @@ import tifffile
 from drawn import lay_out
 from studies import parametrize_with_studies
 
-from measure import Code, MarkShape, Pose, Reason, Status, polygon
+from measure import Code, MarkShape, Reason, ScanOrientation, Status, polygon
 from measure.fiducials.options import BelievedFilm
 from pipeline import read_measurement, read_project
 from pipeline.archive.schema import MEASUREMENTS, Schema, opened
@@ -284,7 +284,7 @@ def test_status_tells_what_changed_outside(folder: Path, printed: projects.Print
 
 def test_status_says_why_a_scan_needs_attention(folder: Path) -> None:
     scan, *_ = read_measurement(folder / "out" / "measurement.db")
-    assumed = replace(scan, frame=replace(scan.frame, pose=Pose("90", decided=False)))
+    assumed = replace(scan, frame=replace(scan.frame, pose=ScanOrientation("90", decided=False)))
     doubted = scan.restated("fiducial", Status.WEAK, Reason("it is dusty", Code.DUST))
     assert scan_doubt(scan) == ""
     assert scan_doubt(assumed) == "scan orientation 90 is assumed"

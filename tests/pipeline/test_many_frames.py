@@ -16,7 +16,7 @@ from projects import command, comparator_points, fiducial_tables, keep_scans, pr
 
 from measure import open_scan
 from measure.flags import Cause, Code, Reason, Status
-from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
 from pipeline import read_project
 from pipeline.archive.checked_results import read_measurement, stored_judging
 from pipeline.archive.results_database import Store
@@ -53,7 +53,7 @@ def scan(number: int) -> MeasuredScan:
         failure = Failure(FailureCode.UNREADABLE, f"scan {number} is damaged")
         frame = FrameMeasurement(image(number), tuple(marks), problems=(Reason(failure.sentence, Code.FAILED_SCAN),))
         return MeasuredScan.failed(f"{image(number)}.tif", frame, failure)
-    frame = FrameMeasurement(image(number), tuple(marks), Pose("0", True, ("set.",)), np.eye(2, 3))
+    frame = FrameMeasurement(image(number), tuple(marks), ScanOrientation("0", True, ("set.",)), np.eye(2, 3))
     ending = "jpg" if number % 2 else "tif"
     return MeasuredScan(f"{image(number)}.{ending}", 12000, 12000, (20.0, 20.0), frame)
 

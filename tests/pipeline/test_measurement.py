@@ -27,7 +27,7 @@ from range_server import range_server
 
 from measure.annotations.lines import Line, Reading
 from measure.flags import Cause, Code, Reason, Status
-from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
 from measure.scans import remote
 from measure.tone.curve import Tone, ToneInformation, power, sampled_curve, srgb
 from measure.tone.estimate import FrameTone
@@ -232,7 +232,9 @@ RICH = measured_record.MeasuredScan(
     FrameMeasurement(
         "roll 7/a",
         (MARK, MarkMeasurement("8", "fiducial", None, None, Status.ABSENT, Reason("not found", Code.NOT_FOUND))),
-        Pose("90m", True, ("this", "and that"), {"0": -3.25, "90m": 1 / 3}, "180", "one question", ("0", "90")),
+        ScanOrientation(
+            "90m", True, ("this", "and that"), {"0": -3.25, "90m": 1 / 3}, "180", "one question", ("0", "90")
+        ),
         RNG.normal(size=(2, 3)),
         (Reason("look here", Code.PITCH),),
         (0.25, 1 / 3, -0.1),

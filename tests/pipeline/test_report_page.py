@@ -17,7 +17,7 @@ from made_up_calibration import set_adjustment as changed
 from projects import present
 
 from adjust.solution.explanations import Explanation
-from measure import Code, MarkMeasurement, Pose, Reason, Status
+from measure import Code, MarkMeasurement, Reason, ScanOrientation, Status
 from measure.results import FrameMeasurement
 from pipeline.report import Problem, ReportData, judge, render_report, write_report
 from pipeline.report.data import frames
@@ -389,7 +389,7 @@ def test_suspects_have_the_advice_of_their_kind(adjusted_data: ReportData) -> No
 
 
 def test_an_assumed_pose_needs_attention_once(measured_data: ReportData, adjusted_data: ReportData) -> None:
-    pose = Pose("0", False, ("The marks are symmetric to 3 µm.",))  # nothing is decided
+    pose = ScanOrientation("0", False, ("The marks are symmetric to 3 µm.",))  # nothing is decided
     data = set_frames(measured_data, lambda frame: replace(frame, pose=pose))
     assert len(judge(data).problems) == 1
     assert "f1, f2, f3, f4, f5: pose assumed (0). The marks are symmetric to 3 µm." in describe(data)

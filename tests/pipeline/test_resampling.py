@@ -17,7 +17,7 @@ from projects import made_record, write_tables
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.transformation import Film
-from measure import MeasurementError, Pose, open_scan
+from measure import MeasurementError, ScanOrientation, open_scan
 from measure.flags import Code, Reason
 from pipeline.files.project_file import read_project
 from pipeline.resampling.canvas import FrameChain, outline_canvas, scan_places
@@ -268,7 +268,7 @@ def test_a_frame_of_far_more_pixels_than_its_scan_is_refused(scan: Path, tmp_pat
 def test_a_frame_whose_place_in_the_scan_is_in_doubt_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Unless an adjustment has oriented it: one of fiducials alone fits any pose."""
     false_alarm = (Reason("chance finds as many with a probability of 1.00", Code.CHANCE),)
-    scans = [made_record(1), made_record(2, pose=Pose("90", False)), made_record(3, problems=false_alarm)]
+    scans = [made_record(1), made_record(2, pose=ScanOrientation("90", False)), made_record(3, problems=false_alarm)]
     monkeypatch.setattr("pipeline.resampling.resample_stage.read_measurement", lambda path: scans)
     project = 'camera = "camera.toml"'
     write_tables(tmp_path, project, camera='name = "K"\nframe_mm = [80.0, 80.0]', comparator="image,point\n")

@@ -36,7 +36,7 @@ from test_command_line import results, rewritten_scans
 from adjust import Prior
 from measure import Status
 from pipeline import read_measurement, read_project, stages
-from pipeline.adjusting import second_visit
+from pipeline.adjusting import second_pass
 from pipeline.archive.made_from import measured_from
 from pipeline.provenance import fingerprint, parts_hash
 from pipeline.report.load import adjusted_data
@@ -234,11 +234,11 @@ def test_an_ended_second_pass_costs_no_other(project: Path, capsys: Capture, mon
 
     def is_deadly(_: object, args: tuple[Any, ...]) -> bool:
         requests.append(args[0])
-        return isinstance(args[0], second_visit.Visit) and args[0].image == "frame2"
+        return isinstance(args[0], second_pass.SearchedAgain) and args[0].image == "frame2"
 
     requests = list[Any]()
     monkeypatch.setattr("pipeline.archive.measure_archive.worker_pool", lambda *_: nullcontext(Loses(is_deadly)))
-    monkeypatch.setattr(second_visit, "_is_missed", lambda *_: True)
+    monkeypatch.setattr(second_pass, "_is_missed", lambda *_: True)
     (project / "comparator.csv").unlink()  # what is shown is new
     code, own_summary = summary(project, capsys, "run")
     assert code == 1
@@ -246,7 +246,7 @@ def test_an_ended_second_pass_costs_no_other(project: Path, capsys: Capture, mon
     problems = [one for one in own_summary["problems"] if "second pass failed" in one["what"]]
     assert [one["what"].split(":")[0] for one in problems] == ["frame2"]
     assert "its process was ended" in problems[0]["what"]
-    assert {visit.image for visit in requests if isinstance(visit, second_visit.Visit)} > {"frame1", "frame2"}
+    assert {visit.image for visit in requests if isinstance(visit, second_pass.SearchedAgain)} > {"frame1", "frame2"}
 
 
 def test_a_place_that_is_held_is_named(project: Path, refusal: Refusal, monkeypatch: pytest.MonkeyPatch) -> None:

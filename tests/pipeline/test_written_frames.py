@@ -16,7 +16,7 @@ from measure.fiducials.scan_orientation import side_in_camera, writing_likelihoo
 from measure.flags import Cause, Code, Reason, Status
 from measure.geometry import POSES, pose_in_camera
 from measure.marks.shapes import Side, WrittenPlace
-from measure.results import Covariance, FrameMeasurement, MarkMeasurement, Pose
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
 from pipeline import read_measurement
 from pipeline.files.camera_file import CameraFile, camera_text, parse_camera, read_camera
 from pipeline.files.object_files import WRITTEN, fill_images, read_images
@@ -40,7 +40,7 @@ def line(text: str, pose: str = "0", side: Side = "top") -> Line:
     return Line({way: Reading(text, 0.9, len(text) * (way == pose)) for way in ways}, pose, outline, side)
 
 
-def scan(image: str, lines: Sequence[Line] | None, pose: Pose | None = None) -> MeasuredScan:
+def scan(image: str, lines: Sequence[Line] | None, pose: ScanOrientation | None = None) -> MeasuredScan:
     mark = MarkMeasurement("1", "fiducial", np.zeros(2), Covariance({Cause.NOISE: np.eye(2)}), Status.MEASURED)
     frame = FrameMeasurement(image, (mark,), pose, writing=None if lines is None else tuple(lines))
     return MeasuredScan(f"{image}.tif", 100, 100, (20.0, 20.0), frame)
@@ -113,7 +113,7 @@ def posed(
     side = next(each for each in sides if side_in_camera(each, pose) == camera_side)
     lines = [line(text, next(each for each in POSES if pose_in_camera(each, pose) == own), side)]
     written = dict(zip(POSES, writing_likelihoods(lines, places, POSES).tolist(), strict=True))
-    return scan(image, lines, Pose(name or pose, False, ("not told.",), written, lines[0].pose))
+    return scan(image, lines, ScanOrientation(name or pose, False, ("not told.",), written, lines[0].pose))
 
 
 def test_frames_of_a_roll_are_named_alike_and_leave_one_question() -> None:
@@ -145,10 +145,10 @@ def test_what_single_frames_do_not_tell_they_tell_together() -> None:
 
 
 def frame_of_roll(image: str, pose: str, *texts: str) -> FrameMeasurement:
-    """Pose "0" or "180" of a frame of 10 x 10 mm in the middle of a scan of 100 px, a pixel being 0.1 mm."""
+    """ScanOrientation "0" or "180" of a frame of 10 x 10 mm in the middle of a scan of 100 px, a pixel being 0.1 mm."""
     scale = 10.0 if pose == "0" else -10.0
     matrix = np.array([[scale, 0.0, 50.0], [0.0, -scale, 50.0]])
-    frame = scan(image, [line(text, pose) for text in texts], Pose(pose, False)).frame
+    frame = scan(image, [line(text, pose) for text in texts], ScanOrientation(pose, False)).frame
     return replace(frame, pixel_from_camera=matrix)
 
 
@@ -240,7 +240,7 @@ def test_the_library_names_a_camera_by_its_plate_or_says_that_it_is_none() -> No
 def test_the_report_draws_lines_in_place_and_those_that_settled_it_stand_out() -> None:
     outline = ((10.0, 10.0), (20.0, 10.0), (20.0, 90.0), (10.0, 90.0))
     lines = [replace(line(text, "90m"), outline_px=outline) for text in ("RUN 7", "8617")]
-    pose = Pose("0", True, ('of 2 lines of writing "RUN 7" speak most',))
+    pose = ScanOrientation("0", True, ('of 2 lines of writing "RUN 7" speak most',))
     drawn = present(writing_picture(replace(scan("a", lines, pose), height_px=200)))
     assert 'transform="matrix(' in drawn
     # 5 page pixels a pixel. Right in its own frame is up in the scan after mirror and turn: down the page.

@@ -27,7 +27,7 @@ _SEARCH_PX = 2.0  # search radius: predictions of an adjusted orientation are fa
 
 
 @dataclass(frozen=True, eq=False)
-class Visit:
+class SearchedAgain:
     """Scan to be searched again.
 
     scan: path or address of its file; sought: predictions of the missed targets.
@@ -57,7 +57,7 @@ def measure_again(
         return None
     field = _adjusted_field(target_field(project), adjustment)
     visits = [
-        Visit(scan.frame.image, fetch_location(scan.scan), missed, settings, project.max_pixels)
+        SearchedAgain(scan.frame.image, fetch_location(scan.scan), missed, settings, project.max_pixels)
         for scan in scans
         if (missed := _missed(field, scan, adjustment, settings))
     ]
@@ -72,7 +72,7 @@ def measure_again(
     return tuple(visited) if any(new is not old for new, old in zip(visited, scans, strict=True)) else None
 
 
-def looked_again(visit: Visit) -> tuple[MarkMeasurement, ...] | str:
+def looked_again(visit: SearchedAgain) -> tuple[MarkMeasurement, ...] | str:
     """Measure the predicted targets of a scan; return those found, or why the scan cannot be searched. Raises nothing
     but interrupts."""
     try:
