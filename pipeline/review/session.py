@@ -216,10 +216,15 @@ class Session:
     """Review of a project. Thread-safe."""
 
     def __init__(self, project: Project, who: str) -> None:
-        """Raises InputError if there are no checked results and no scans."""
+        """Raises InputError if there are no checked results and no scans, or results of a camera whose file is gone."""
         self.project, self.who = project, who
         self.folder = project.path.resolve().parent
         self.looking = Looking(project.measurement_path, lambda image: self.learned.image_camera(image))
+        if project.missing_camera and self.looking.judging() is not None:
+            raise InputError(
+                f"{self.folder / project.missing_camera}: there is no such file, but its marks are in "
+                f"{project.measurement_path}. Put the file back; or delete that database, and draw the camera."
+            )
         self._lock = threading.RLock()
         self._judging: int | None = None
         self._file_state: FileState | None = None  # of the decisions when they were read

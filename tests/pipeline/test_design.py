@@ -78,10 +78,14 @@ def test_what_would_help_is_tried(tmp_path: Path) -> None:
     assert doubled["k3"] == pytest.approx(100 * (1 - math.sqrt(0.5)), abs=1.0)
 
 
-def test_design_writes_what_it_found(tmp_path: Path, capsys: Capture, printed: Printed) -> None:
-    swept = '[[design.sweep]]\nquantity = "design.transformation"\nvalues = ["similarity", "affine"]\n[[image]]'
-    scene = small(tmp_path, ("[[image]]", swept), ('"torlegard", ', '"torlegard", value = {k3 = -6e-6}, '))
-    assert command("design", scene, "--json") == DONE
+def swept(folder: Path) -> Path:
+    """The scene with a sweep, and k3 given."""
+    sweep = '[[design.sweep]]\nquantity = "design.transformation"\nvalues = ["similarity", "affine"]\n[[image]]'
+    return small(folder, ("[[image]]", sweep), ('"torlegard", ', '"torlegard", value = {k3 = -6e-6}, '))
+
+
+def test_design_writes_what_it_found(tmp_path: Path, capsys: Capture) -> None:
+    assert command("design", swept(tmp_path), "--json") == DONE
     folder = tmp_path / "small-design"
     content = json.loads((folder / "design.json").read_text())
     assert content == json.loads(capsys.readouterr().out)
@@ -96,12 +100,15 @@ def test_design_writes_what_it_found(tmp_path: Path, capsys: Capture, printed: P
     assert 0.0 < content["point_summary"]["Z"]["rms"] < 0.001
     assert targets["smallest_error"]["median"] > 4.13 * 5.0  # delta0 times sigma, over the root of a part of 1
     assert {one["parameter"] for one in content["reliability"]["camera"]} >= {"IO.K.c", "IO.K.k3", "FID.K.a.x"}
-    (swept,) = content["sweeps"]
-    assert [step["value"] for step in swept["steps"]] == ["similarity", "affine"]
-    drawn = ElementTree.parse(folder / swept["picture"]).getroot()
+    (sweep,) = content["sweeps"]
+    assert [step["value"] for step in sweep["steps"]] == ["similarity", "affine"]
+    drawn = ElementTree.parse(folder / sweep["picture"]).getroot()
     drawn_words = {word.text for word in drawn.iter("{http://www.w3.org/2000/svg}text")}
     assert drawn_words >= {"similarity", "affine", "design.transformation", "c", "k3"}
-    table = printed("design", scene, tmp_path / "there")
+
+
+def test_design_prints_its_tables(tmp_path: Path, printed: Printed) -> None:
+    table = printed("design", swept(tmp_path), tmp_path / "there")
     k3 = next(line for line in table.splitlines() if line.startswith("│ k3"))
     assert k3.count("× 10⁻⁶") == 3  # value, sigma, and that of the photographs alone, by the value's power of ten
     assert "minimal detectable errors" in table

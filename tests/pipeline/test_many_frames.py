@@ -21,6 +21,8 @@ from pipeline import read_project
 from pipeline.archive.checked_results import read_measurement, stored_judging
 from pipeline.archive.results_database import Store
 from pipeline.archive.thumbnails import Thumbnails, ThumbnailStore
+from pipeline.errors import InputError
+from pipeline.files.project_file import read_undrawn
 from pipeline.report import ReportData, Thumbnail, judge, render_report
 from pipeline.report.frame_views import MOST_CARDS
 from pipeline.report.load import MOST_FRAMES, frame_counts, reduced, report_data
@@ -164,6 +166,15 @@ def test_natural_points_are_no_questions_to_a_reviewer(tmp_path: Path) -> None:
     write_comparator(tmp_path / "comparator.csv", points, frames, digest)
     entries = Session(read_project(project), "bob").page(Filters())["entries"]
     assert [(one["point"], one["kind"]) for one in entries] == [("m1", "fiducial")]
+
+
+def test_marks_whose_camera_file_is_gone_are_no_questions(tmp_path: Path) -> None:
+    project, scans = stored(tmp_path)
+    keep_scans(tmp_path / "out" / "measurement.db", scans)
+    camera = read_project(project).default_camera.path
+    camera.unlink()
+    with pytest.raises(InputError, match=f"{camera.name}: there is no such file, but its marks are in"):
+        Session(read_undrawn(project), "bob")
 
 
 @pytest.mark.parametrize("is_good", [True, False])
