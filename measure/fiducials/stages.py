@@ -1,8 +1,8 @@
 """Search for a frame as a list of stages, which differ in region, pitch, film model, tone curve and surroundings.
 
 One loop makes the stages in order and skips those that an earlier result makes unnecessary. One criterion accepts a
-frame: the expected number of false frames in all stages so far, or in those under the given pitch alone, which is
-likelier than all others together.
+frame: the expected number of false frames in all stages so far, or in those under the given pitch alone, whose prior
+probability is above that of all others together.
 """
 
 from collections.abc import Iterable, Sequence
@@ -143,15 +143,15 @@ def find_frame(
     """Find the frame of a scan. pitch_um: given by the user or the file, None if unknown."""
     stages = list_stages(scan, layout, pitch_um, options)
     search, result = FrameSearch(scan, layout, options), SearchResult()
-    found, every, at_given = Found(), 0, 0
+    found, hypotheses_so_far, hypotheses_at_given_pitch = Found(), 0, 0
     for stage in stages:
         if stage.is_unnecessary(found):
             continue
         if stage.tone is None:
-            every += len(stage.hypotheses)
-            at_given += len(stage.hypotheses) if stage.is_given or stage.at_given else 0
+            hypotheses_so_far += len(stage.hypotheses)
+            hypotheses_at_given_pitch += len(stage.hypotheses) if stage.is_given or stage.at_given else 0
             result = search_stage(search, stage)
-        tried = at_given if stage.at_given else every
+        tried = hypotheses_at_given_pitch if stage.at_given else hypotheses_so_far
         start = scan if stage.tone is None else scan.replace_tone(stage.tone)
         frames = measure_stage(start, layout, stage, result, tried)
         expected, frame = frames[0] if frames else (np.inf, None)
@@ -162,7 +162,8 @@ def find_frame(
                 misfit = explain_misfit(frame) if frame else _NOTHING
                 found = replace(found, result=result, frame=frame, is_taken=False, misfit=misfit)
         else:
-            likely = [] if stage.at_given else [each for each in frames if _is_taken_if_given(each, at_given / tried)]
+            share = hypotheses_at_given_pitch / tried
+            likely = [] if stage.at_given else [each for each in frames if _is_accepted_at_given_pitch(each, share)]
             rejected = [each for each in (found.faint, *frames) if each and each not in likely]
             unsure = (*found.unsure, *(frame for _, frame in likely))
             found = replace(found, unsure=unsure, faint=min(rejected, key=itemgetter(0), default=None))
@@ -251,9 +252,9 @@ def _evaluate(frame: Frame, result: SearchResult, tried: int) -> Evaluated | Non
     return 2 * tried * min(as_measured, false_placements(result, placement)), most
 
 
-def _is_taken_if_given(evaluated: Evaluated, at_given: float) -> bool:
-    """Whether a frame would be taken if its pitch were given. at_given: share of the hypotheses under the given one."""
-    return evaluated[1].accepted or evaluated[0] * at_given <= MAX_FALSE_FRAMES
+def _is_accepted_at_given_pitch(evaluated: Evaluated, share: float) -> bool:
+    """Whether a frame would be accepted if its pitch were given. share: of the hypotheses under the given pitch."""
+    return evaluated[1].accepted or evaluated[0] * share <= MAX_FALSE_FRAMES
 
 
 def _places_to_try(found: Sequence[Placement]) -> list[Placement]:
