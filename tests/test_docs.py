@@ -14,8 +14,11 @@ import reseau
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES_OF_THE_DEMONSTRATION = (
-    "start/film-scan.md", "how-to/plan-a-network.md", "how-to/choose-a-model.md", "notebooks/film-scan.ipynb"
-)  # fmt: skip
+    "start/film-scan.md",
+    "how-to/plan-a-network.md",
+    "how-to/choose-a-model.md",
+    "notebooks/film-scan.ipynb",
+)
 MKDOCS = DOCS.parent / ".venv-docs" / "bin" / "mkdocs"
 
 

@@ -298,8 +298,15 @@ def _solved(matrix: Array, right: Array) -> tuple[Array, Mask]:
 
 
 FILM_NAMES = (
-    "none", "congruent", "similarity", "affine", "projective", "bilinear", "conformal(n)", "polynomial(n)",
-)  # fmt: skip
+    "none",
+    "congruent",
+    "similarity",
+    "affine",
+    "projective",
+    "bilinear",
+    "conformal(n)",
+    "polynomial(n)",
+)
 
 
 @lru_cache

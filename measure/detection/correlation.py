@@ -160,6 +160,7 @@ def _reduced(image: Map, factor: int) -> Map:
 
 
 def _enlarged(small: NDArray[np.integer | np.floating], image: Map) -> Map:
+    """Enlarge a reduced image to the size of another."""
     return np.asarray(cv2.resize(small, image.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
 
 

@@ -203,6 +203,7 @@ class Explanation:
 
     @property
     def is_quiet(self) -> bool:
+        """Whether there is no outlier."""
         return not (self.film_is_more or any(each.film_mm or each.off_mm.any() for each in self.frames.values()))
 
     @property
@@ -361,6 +362,7 @@ def _doubt(mark: MarkMeasurement, cause: Cause, variance_px2: float, reason: Rea
 
 
 def _replace_marks(frame: FrameMeasurement, changed: Mapping[str, MarkMeasurement]) -> FrameMeasurement:
+    """Replace some fiducials, by name."""
     marks = (changed.get(mark.point, mark) if mark.kind == "fiducial" else mark for mark in frame.marks)
     return replace(frame, marks=tuple(marks))
 
@@ -581,6 +583,7 @@ def _scattering_film(shared: Explanation, film: BelievedFilm) -> Reason:
 
 
 def _distances(names: Sequence[str], off_mm: Array) -> str:
+    """List the marks with the largest deviations."""
     worst = np.argsort(-off_mm, kind="stable")[:_NAMED_MARKS]
     rest = f", {len(names) - len(worst)} others by less" if len(names) > len(worst) else ""
     return ", ".join(f"{names[k]} by {off_mm[k]:.3f} mm" for k in worst) + rest

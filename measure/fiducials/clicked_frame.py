@@ -112,6 +112,7 @@ def _similarity(camera: Array, up_mm: Array, pose: str) -> tuple[Array, float]:
 
 
 def _turn_rad(up_from_mm: Array, pose: str) -> float:
+    """Rotation of the frame relative to a scan orientation."""
     own = up_from_mm[:, :2] @ np.linalg.inv(UP_FROM_CAMERA[pose])
     return float(np.arctan2(own[1, 0], own[0, 0]))
 

@@ -156,6 +156,7 @@ class FrameMarks:
 
     @property
     def redundancy(self) -> int:
+        """Redundancy with size, stretch and shear free."""
         return self.beyond_affine.redundancy
 
     def chi_square(self, film_mm: float) -> float:

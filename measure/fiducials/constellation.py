@@ -152,6 +152,7 @@ def _fit_similarity(from_: Complex, to: Complex, weight: Array) -> tuple[Complex
 
 
 def _similarity_matrix(scale: complex | Complex, offset: complex | Complex) -> Array:
+    """(2, 3) matrix of a similarity."""
     return np.array([[scale.real, -scale.imag, offset.real], [scale.imag, scale.real, offset.imag]])
 
 

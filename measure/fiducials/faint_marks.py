@@ -365,6 +365,7 @@ class _Response:
 
     @cached_property
     def template(self) -> Array:
+        """Template of the mark at this phase."""
         return self.field.template(self.fraction)
 
     @cached_property

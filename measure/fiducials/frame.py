@@ -162,6 +162,7 @@ class Frame:
 
     @cached_property
     def inlier_fits(self) -> dict[int, MarkFit]:
+        """Fits of the inliers by index."""
         fits = ((index, self.detections[index].fit) for index in np.flatnonzero(self.inliers).tolist())
         return {index: fit for index, fit in fits if fit is not None}
 
@@ -222,6 +223,7 @@ class Frame:
 
     @property
     def measured_count(self) -> int:
+        """Number of unblemished marks."""
         return len(self.unblemished)
 
     @property

@@ -147,6 +147,7 @@ def shared_blurs(fits: Sequence[MarkFit]) -> list[SharedBlur | None]:
 
 
 def _log_total_px(blur_px: float) -> float:
+    """Logarithm of the total blur, pixel included."""
     return float(np.log(blur_px**2 + PIXEL_VARIANCE_PX2) / 2)
 
 
@@ -188,6 +189,7 @@ class SharedShape:
 
 
 def _density(off: Array, sigma: Array) -> float:
+    """Density of independent normal deviations."""
     return float(np.prod(np.exp(-0.5 * (off / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)))
 
 
@@ -323,6 +325,7 @@ def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape, sig
 
 
 def _radius_mm(mark: Mark) -> float:
+    """Radius of the outline of a round mark."""
     parts = mark.parts if isinstance(mark, MarkShape) else ()
     return max(part.radius_mm for part in parts if isinstance(part, Disk | Ring))
 

@@ -50,6 +50,7 @@ class Detection:
 
     @property
     def is_clear(self) -> bool:
+        """Whether the fit correlates clearly with the drawing."""
         return self.fit is not None and self.fit.is_clear
 
     def amend(
@@ -111,6 +112,7 @@ def detect_mark(
 
 
 def _match(scan: Scan, expected: MarkPrediction, options: MatchOptions, before: MarkFit | None) -> MarkFit:
+    """Match the mark from its predicted place."""
     mark, start = expected.mark, expected.pixel_from_mark
     coded = scan.replace_tone(LINEAR) if isinstance(mark, MarkTemplate) else scan  # stored values
     window = read_window(coded, mark_window(mark, start, options.margin_px + BESIDE_PX), expected.weights)

@@ -366,6 +366,7 @@ def _widen_drawings(frame: Frame, among: Sequence[int]) -> Frame:
 
 
 def _replace_tone(frame: Frame, tone: Tone) -> Frame:
+    """Return the frame of the scan with another tone curve, or sharpening."""
     return replace(frame, scan=frame.scan.replace_tone(tone))
 
 
@@ -480,6 +481,7 @@ def _needs_frame(frame: Frame, index: int, fit: MarkFit, linear_sigma: float) ->
 
 
 def _mark_tones(frame: Frame) -> dict[int, MarkTone]:
+    """Information of the clear marks on the tone curve."""
     return {index: fit.tone for index, fit in frame.clear_fits.items() if fit.tone is not None}
 
 
@@ -514,6 +516,7 @@ def _lens_covariances(frame: Frame) -> dict[int, Array]:
 
 
 def _by_significance(frame: Frame) -> list[int]:
+    """Indices of the clear marks, the most significant first."""
     return sorted(frame.clear_fits, key=lambda index: -frame.clear_fits[index].significance)
 
 

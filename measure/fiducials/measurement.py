@@ -77,6 +77,7 @@ def measure_fiducials(
 
 
 def _refused(frame: FrameMeasurement, why: Reason) -> FrameMeasurement:
+    """Reject all marks of the frame that are observations."""
     marks = (
         replace(mark, status=Status.REJECTED, reason=why) if mark.status.is_observation else mark
         for mark in frame.marks

@@ -69,6 +69,7 @@ def absent_frame(
 
 
 def _too_coarse(layout: FiducialLayout, pitch_um: float) -> Reason:
+    """Warn if the pixels are too large for the marks' finest detail; empty otherwise."""
     finest_um = 1000 * min(finest_detail_mm(mark.mark) for mark in layout.marks)
     if finest_um >= _PLAIN_PX * pitch_um:
         return NO_REASON
@@ -116,12 +117,14 @@ def present_frame(
 
 
 def _unmeasured(point: str, detection: Detection, place_px: Array, why: Reason) -> MarkMeasurement:
+    """Row of a mark without a measurement: predicted, or absent outside of the scan."""
     if detection.inside:
         return MarkMeasurement(point, "fiducial", place_px, None, Status.PREDICTED, why)
     return MarkMeasurement(point, "fiducial", None, None, Status.ABSENT, detection.reason)
 
 
 def _problems(frame: Frame, pitch_um: tuple[float, float] | None) -> list[Reason]:
+    """Problems of the interior orientation: an implausible stretch, or no redundancy."""
     problems = []
     per_mm = np.hypot(*frame.pixel_from_camera[:, :2].T)
     given = pitch_um or (1.0, 1.0)

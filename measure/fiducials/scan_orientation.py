@@ -257,6 +257,7 @@ def _writing_sentence(best: _Hypothesis, rival: _Hypothesis, layout: FiducialLay
 
 
 def _difference(one: int, other: int, layout: FiducialLayout) -> str:
+    """Feature that distinguishes two marks of the camera."""
     if one < 0 or other < 0:
         return "marks where the other orientation has none"
     (core, dots), (other_core, other_dots) = (_figure(layout.marks[index].mark) for index in (one, other))
@@ -394,6 +395,7 @@ _BARE = View(np.zeros((1, 1)), _EVERYWHERE, _EVERYWHERE)
 
 
 def _turn_and_pad(picture: Any, turn: Array, spare: int) -> Any:
+    """Rotate by quarter turns, and pad by repeating the edge."""
     return np.pad(turn_by_quarters(picture, turn), spare, mode="edge")
 
 
@@ -520,6 +522,7 @@ class MarkSite:
 
 
 def _draw_view(mark: Mark, grid_from_mark: Array, blur_px: float) -> View:
+    """Draw a mark centred on its origin."""
     place = np.column_stack([grid_from_mark, np.zeros(2)])
     half = int(np.ceil(np.abs(extent_px(mark, place)).max() + 2 * _ABOUT_PX))
     place[:, 2] = half

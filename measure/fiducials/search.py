@@ -215,6 +215,7 @@ class FrameSearch:
         return correlate_windows(self.scan, views, places, reach / max(drawn_mm), *how)
 
     def _views(self, drawn_mm: Pair) -> list[MarkView]:
+        """Views of all marks, pose by pose."""
         linear = np.diag([1 / drawn_mm[0], -1 / drawn_mm[1]])  # from mm right and up to pixels across and down
         return [
             MarkView(mark.mark, linear @ UP_FROM_CAMERA[pose]) for pose in self._poses for mark in self.layout.marks

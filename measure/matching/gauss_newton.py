@@ -324,6 +324,7 @@ class PictureFit:
 
     @property
     def contrast_dn(self) -> float:
+        """Absolute contrast of the mark."""
         return abs(self.model.contrast_dn)
 
     @property

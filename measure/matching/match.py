@@ -115,6 +115,7 @@ def _fit(
 def _start_fit(
     window: ScanWindow, mark: Mark, start: Array, options: MatchOptions, coarse_px: float | None
 ) -> PictureFit:
+    """Set up a fit of the part of the window around the mark's expected place."""
     local = start - np.column_stack([np.zeros((2, 2)), window.origin_px])
     col0, row0, width, height = mark_window(mark, local, options.margin_px + _SPARE_PX)
     rows, cols = (
@@ -135,6 +136,7 @@ def _is_right(fit: PictureFit) -> bool:
 
 
 def _mark_fit(fit: PictureFit, window: ScanWindow) -> MarkFit:
+    """Convert the fit of a part of a window to a result in pixels of the scan."""
     model, used = fit.model, fit.telling
     information = float(model.information[fit.used].sum())
     noise, is_white = as_if_white(model.scores, fit.used, len(model.design), information)

@@ -158,6 +158,7 @@ def damage(residuals: Array, area: Mask, sigmas: float, floor_dn: float, is_loss
 
 
 def _opened(mask: Mask) -> Mask:
+    """Morphological opening: keep what is wider than a pixel."""
     # An even structuring element is off-centre: the anchors of erosion and dilation must be opposite.
     speck = np.ones((2, 2), np.uint8)
     eroded = cv2.erode(mask.astype(np.uint8), speck, anchor=(0, 0))

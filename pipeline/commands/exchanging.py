@@ -12,9 +12,19 @@ from pipeline.text.wording import counted, did_you_mean
 
 TEMPLATES = ("project", "camera", "scene", "keys")
 FAMILIES = (  # `FAMILY_NAMES`, without numpy
-    "none", "torlegard", "brown", "australis", "aicon", "opencv", "opencv_fisheye", "juhl", "ebner", "gruen",
-    "legendre(n)", "fourier(n)",
-)  # fmt: skip
+    "none",
+    "torlegard",
+    "brown",
+    "australis",
+    "aicon",
+    "opencv",
+    "opencv_fisheye",
+    "juhl",
+    "ebner",
+    "gruen",
+    "legendre(n)",
+    "fourier(n)",
+)
 
 
 def resample(

@@ -308,8 +308,14 @@ class Dense:
 
     def residuals(self, x: Array) -> Array:
         (c, x0, y0, k3), exterior, points = x[:4], x[4:28].reshape(4, 6), x[28:].reshape(-1, 3)
-        truth = nets.Truth(c, x0, y0, distortion={"k3": 1e-7 * k3}, stations=tuple(map(tuple, exterior[:, :3])),
-                      attitudes=tuple(map(tuple, exterior[:, 3:])))  # fmt: skip
+        truth = nets.Truth(
+            c,
+            x0,
+            y0,
+            distortion={"k3": 1e-7 * k3},
+            stations=tuple(map(tuple, exterior[:, :3])),
+            attitudes=tuple(map(tuple, exterior[:, 3:])),
+        )
         network = self.network
         rows = zip(network.observations.image, network.observations.point, network.observations.xy_mm, strict=True)
         result = [
@@ -345,8 +351,9 @@ def test_observed_orientations_and_distances_as_in_a_dense_adjustment() -> None:
     assert np.abs(difference / sigmas).max() < 1e-5
     assert result.vpv == pytest.approx(dense.vpv, rel=1e-9)
     cofactor = dense.cofactor * np.outer(scale, scale)
-    np.testing.assert_allclose(result.cofactor_of(NAMES) / np.outer(sigmas, sigmas),
-                               cofactor / np.outer(sigmas, sigmas), atol=1e-6)  # fmt: skip
+    np.testing.assert_allclose(
+        result.cofactor_of(NAMES) / np.outer(sigmas, sigmas), cofactor / np.outer(sigmas, sigmas), atol=1e-6
+    )
     conditions = 2 * 24 + 4 + 21 + 4
     assert (result.conditions, result.redundancy) == (conditions, conditions - len(NAMES))
     assert sum(group.redundancy for group in result.groups.values()) == pytest.approx(result.redundancy)
