@@ -1,7 +1,8 @@
 """`reseau adjust` and `reseau choose`: adjust comparator coordinates, with scanner terms and the eccentricity of disks;
 select film deformation and distortion model."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from adjust.functional_model.scanner import carriage_terms, smooth_terms
-from adjust.model_selection.model_choice import Candidate, Choice, choose
+from adjust.model_selection.model_choice import Choice, choose
 from adjust.model_selection.scanner_choice import bent_network, choose_bends
 from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.problem.network import Network
@@ -32,8 +33,6 @@ from pipeline.results.record_json import write_record
 from pipeline.results.stage_files import choice_content
 from pipeline.text.wording import listed
 from pipeline.types import Array
-
-UM_PER_MM = 1000.0
 
 _ROUNDS = 4  # largest number of corrections: each is off by its own relative error, so the second is below the noise
 _SETTLED_SIGMAS = 0.01  # change of the correction that ends the iteration, standard deviations of an observation
@@ -68,7 +67,7 @@ def add_scanner_bends(
             f"{project.path}: [adjust] scanner is {given}, but no image has a film transformation, and a digital "
             'camera no scanner. Write scanner = "none".'
         )
-    sigma_mm = settings.scanner_sigma_um / UM_PER_MM
+    sigma_mm = settings.scanner_sigma_um / 1000.0
     if settings.scanner == "auto":
         return choose_bends(network, adjusted, sigma_mm)
     smooth, carriage = smooth_terms(films), carriage_terms(films)
@@ -83,15 +82,6 @@ def add_scanner_bends(
     return bent_network(network, terms, sigma_mm), ()
 
 
-def name_scanners(project: Project, network: Network) -> Network:
-    """Network whose images name their scanners, whether scanner terms are estimated or not."""
-    images = tuple(
-        image if image.transformation == "none" else replace(image, scanner=project.image_scanner(image.name))
-        for image in network.images
-    )
-    return replace(network, images=images)
-
-
 def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustment:
     """Adjust measured marks. Warnings and notes are part of the result.
 
@@ -99,19 +89,16 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     """
     options = adjustment_options(project.adjust)
     adjusted = partial(adjust, options=options)
-    misnamed, notes = _misnamed(project, marks), (*_assumed_pitch(project), *_unmeasured(project, marks))
+    misnamed, notes = _misnamed(project, marks), _notes(project, marks)
     if project.disk_radius > 0.0:
         target_field.check_spacing(project, target_field.target_field(project))
     network, left_out = build_network(project, marks)
     network, untold = add_scanner_bends(project, network, adjusted)
     first = adjust_unmodelled(network, options) if project.adjust.unmodelled == "estimate" else adjusted(network)
-    adjustment, network = first, first.network  # without images that were left out
-    uncorrected = np.zeros_like(network.observations.xy_mm)
+    adjustment, uncorrected = first, tuple[str, ...]()
     if project.disk_radius > 0.0:
-        normals = project.given_points.normals if project.given_points else {}
-        eccentricities = partial(_eccentricities, given=normals, radius=project.disk_radius)
-        adjustment, uncorrected = _correct_eccentricity(network, adjustment, options, eccentricities)
-    remarks = (*adjustment.remarks, *left_out, *untold, *misnamed, *_not_corrected(network, uncorrected))
+        adjustment, uncorrected = _correct_eccentricity(project, first, options)
+    remarks = (*adjustment.remarks, *left_out, *untold, *misnamed, *uncorrected)
     return replace(adjustment, unmodelled_mm=first.unmodelled_mm, remarks=remarks, unused=notes)
 
 
@@ -128,25 +115,33 @@ def adjustment_options(settings: AdjustSettings) -> Options:
 
 
 def _correct_eccentricity(
-    network: Network,
-    adjustment: Adjustment,
-    options: Options,
-    eccentricities: Callable[[Adjustment], tuple[Array, Array]],
-) -> tuple[Adjustment, Array]:
-    """Iterate adjustment and correction of disks; also return the largest uncorrected eccentricities (n, 2), mm."""
-    applied = uncorrected = np.zeros_like(network.observations.xy_mm)
+    project: Project, adjustment: Adjustment, options: Options
+) -> tuple[Adjustment, tuple[str, ...]]:
+    """Iterate adjustment and correction of disks; also return a remark on eccentricities that are not corrected."""
+    network = adjustment.network  # without images that were left out
+    observations = network.observations
+    sigmas_mm = np.sqrt(np.diagonal(observations.covariance_mm2, axis1=1, axis2=2))
+    normals = project.given_points.normals if project.given_points else {}
+    applied = uncorrected = np.zeros_like(observations.xy_mm)
     for _ in range(_ROUNDS):
         if not adjustment.converged:
             break
-        wanted, uncorrected = eccentricities(adjustment)
-        if _largest_sigmas(network, wanted - applied) < _SETTLED_SIGMAS:
+        wanted, uncorrected = _eccentricities(adjustment, normals, project.disk_radius)
+        if np.max(np.abs(wanted - applied) / sigmas_mm, initial=0.0) < _SETTLED_SIGMAS:
             break
         applied = wanted
-        xy_mm = network.observations.xy_mm - applied
-        shifted = replace(network, observations=replace(network.observations, xy_mm=xy_mm))
+        shifted = replace(network, observations=replace(observations, xy_mm=observations.xy_mm - applied))
         corrected = adjust(shifted, options=options)
         adjustment = replace(corrected, left_out={**adjustment.left_out, **corrected.left_out})
-    return adjustment, uncorrected
+    worst = float(np.max(np.abs(uncorrected) / sigmas_mm, initial=0.0))
+    if worst <= _NOTICEABLE_SIGMAS:
+        return adjustment, ()
+    remark = (
+        f"The disks' eccentricity is not corrected, for their normals are not known; it can reach {worst:.1f} sigma "
+        f"({1000.0 * float(np.abs(uncorrected).max()):.2f} µm). Add the columns nX, nY, nZ to the points, or use "
+        "smaller disks."
+    )
+    return adjustment, (remark,)
 
 
 def _eccentricities(adjustment: Adjustment, given: Mapping[str, Array], radius: float) -> tuple[Array, Array]:
@@ -158,40 +153,20 @@ def _eccentricities(adjustment: Adjustment, given: Mapping[str, Array], radius: 
     row_of = {id: row for row, id in enumerate(ids)}
     plane = target_field.plane_normal(coordinates)
     known_part, unknown_part = np.zeros_like(observations.xy_mm), np.zeros_like(observations.xy_mm)
-    for image in network.images:
-        rows = [
-            i
-            for i, (name, kind) in enumerate(zip(observations.image, observations.kind, strict=True))
-            if name == image.name and kind == "target"
-        ]
-        if not rows:
-            continue
+    rows_of = defaultdict[str, list[int]](list)
+    for row, (name, kind) in enumerate(zip(observations.image, observations.kind, strict=True)):
+        if kind == "target":
+            rows_of[name].append(row)
+    for name, rows in rows_of.items():
         at = [row_of[observations.point[i]] for i in rows]
-        model, places = adjusted_image(adjustment, image.name), coordinates[at]
+        model, places = adjusted_image(adjustment, name), coordinates[at]
         normals, known = target_field.disk_normals([ids[k] for k in at], places, given, plane, model.station)
         known_part[rows] = np.where(known[:, None], target_field.eccentricity_mm(model, places, normals, radius), 0.0)
         sight = (model.station - places) / np.linalg.norm(model.station - places, axis=1, keepdims=True)
-        slanted = (sight + target_field.across(sight)[0]) / np.sqrt(
-            2.0
-        )  # at 45° to it, where the eccentricity is largest
+        # at 45° to it, where the eccentricity is largest
+        slanted = (sight + target_field.across(sight)[0]) / np.sqrt(2.0)
         unknown_part[rows] = np.where(known[:, None], 0.0, target_field.eccentricity_mm(model, places, slanted, radius))
     return known_part, unknown_part
-
-
-def _largest_sigmas(network: Network, change_mm: Array) -> float:
-    """Largest change of an observation, in its standard deviations."""
-    sigmas = np.sqrt(np.diagonal(network.observations.covariance_mm2, axis1=1, axis2=2))
-    return float(np.max(np.abs(change_mm) / sigmas, initial=0.0))
-
-
-def _assumed_pitch(project: Project) -> Iterator[str]:
-    """Yield a note where pixels were converted to mm by an assumed pixel pitch."""
-    path = project.comparator
-    if project.pitch_um is None and not project.scans and path.exists() and has_pixels_alone(path):
-        yield (
-            f"Nothing says how large a pixel is: {ASSUMED_PITCH_UM:g} µm are assumed. Of all in mm and µm only ratios "
-            "count; set pitch_um in project.toml to have them."
-        )
 
 
 def _misnamed(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, ...]:
@@ -208,27 +183,22 @@ def _misnamed(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, 
     )
 
 
-def _unmeasured(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, ...]:
-    """Note on given points that no image shows: an effect of large patterns, but also of a wrong point number."""
+def _notes(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, ...]:
+    """Notes on an assumed pixel pitch, and on given points that no image shows."""
+    notes, path = [], project.comparator
+    if project.pitch_um is None and not project.scans and path.exists() and has_pixels_alone(path):
+        notes.append(
+            f"Nothing says how large a pixel is: {ASSUMED_PITCH_UM:g} µm are assumed. Of all in mm and µm only ratios "
+            "count; set pitch_um in project.toml to have them."
+        )
     observed = {mark.point for mark in marks if mark.status.is_observation and mark.kind not in ON_FILM}
     lost = [id for id in project.object_points if id not in observed]
-    if project.given_points is None or not lost:
-        return ()
-    return (
-        f"Given but measured in no image: {'point' if len(lost) == 1 else f'{len(lost)} points,'} {listed(lost)}. "
-        f"If an image shows {'it' if len(lost) == 1 else 'one'}, look for a wrong point number or coordinate.",
-    )
-
-
-def _not_corrected(network: Network, possible_mm: Array) -> tuple[str, ...]:
-    worst = _largest_sigmas(network, possible_mm)
-    if worst <= _NOTICEABLE_SIGMAS:
-        return ()
-    return (
-        f"The disks' eccentricity is not corrected, for their normals are not known; it can reach {worst:.1f} sigma "
-        f"({1000.0 * float(np.abs(possible_mm).max()):.2f} µm). Add the columns nX, nY, nZ to the points, or use "
-        "smaller disks.",
-    )
+    if project.given_points is not None and lost:  # an effect of large patterns, but also of a wrong point number
+        notes.append(
+            f"Given but measured in no image: {'point' if len(lost) == 1 else f'{len(lost)} points,'} {listed(lost)}. "
+            f"If an image shows {'it' if len(lost) == 1 else 'one'}, look for a wrong point number or coordinate."
+        )
+    return tuple(notes)
 
 
 def run_choose(project: Project, reporter: Reporter) -> tuple[Choice, dict[str, object]]:
@@ -243,8 +213,13 @@ def run_choose(project: Project, reporter: Reporter) -> tuple[Choice, dict[str, 
             sizes = {camera.name: camera.frame_mm for camera in project.cameras.values() if camera.frame_mm}
             half_mm = {name: (width / 2.0, height / 2.0) for name, (width, height) in sizes.items()}
             own = adjust_marks(project, marks)
+            # All images name their scanners, whether scanner terms are estimated or not.
+            images = tuple(
+                image if image.transformation == "none" else replace(image, scanner=project.image_scanner(image.name))
+                for image in own.network.images
+            )
             choice = choose(
-                replace(own, network=name_scanners(project, own.network)),
+                replace(own, network=replace(own.network, images=images)),
                 adjustment_options(project.adjust),
                 half_mm,
                 lambda name, _: count(name, 0, 1),
@@ -260,26 +235,21 @@ def print_choice(choice: Choice, console: Console, path: Path) -> None:
     columns = ("model", "unknowns", "redundancy", "sigma0", "v'Pv", "AIC", "AICc", "left out, µm", "correlated")
     table = Table(*columns, title="Candidates", title_justify="left")
     for each in choice.candidates:
-        style = "bold green" if each is choice.chosen else ""
-        table.add_row(Text(each.model.name), *_numbers(each), style=style)
+        predicted = each.cross_validation
+        numbers = (
+            str(each.unknowns),
+            str(each.redundancy),
+            f"{each.sigma0:.3f}",
+            f"{each.vpv:.1f}",
+            f"{each.aic:.1f}",
+            f"{each.aicc:.1f}",
+            "none" if predicted is None else f"{predicted.rms_um:.2f}",
+            str(len(each.correlated)),
+        )
+        shown = ("no solution",) if each.problem else numbers
+        table.add_row(Text(each.model.name), *shown, style="bold green" if each is choice.chosen else "")
     console.print(table)
     console.print(Text(choice.verdict, style="bold"))
     for reason in choice.reasons:
         console.print(Text(f"- {reason}"))
     console.print(f"choice: {path}", soft_wrap=True, markup=False, highlight=False)
-
-
-def _numbers(candidate: Candidate) -> tuple[str, ...]:
-    if candidate.problem:
-        return ("no solution",)
-    predicted = candidate.cross_validation
-    return (
-        str(candidate.unknowns),
-        str(candidate.redundancy),
-        f"{candidate.sigma0:.3f}",
-        f"{candidate.vpv:.1f}",
-        f"{candidate.aic:.1f}",
-        f"{candidate.aicc:.1f}",
-        "none" if predicted is None else f"{predicted.rms_um:.2f}",
-        str(len(candidate.correlated)),
-    )

@@ -15,7 +15,7 @@ from rich.text import Text
 from adjust.functional_model.families import family as family_of
 from adjust.functional_model.lens import Lens
 from adjust.problem.parameter import Parameter
-from adjust.quality.lens_comparison import CameraCalibration, Comparison, Test, Use, compare, sigmas
+from adjust.quality.lens_comparison import CameraCalibration, Comparison, Use, compare, sigmas
 from pipeline.drawing import svg
 from pipeline.errors import InputError
 from pipeline.report.numbers import fixed, value_and_sigma
@@ -149,24 +149,22 @@ def _why(comparison: Comparison, level: float) -> str:
         "space": "the camera's attitude and a similarity of the fiducial marks",
         "flat": "the camera's attitude and station over flat ground, and a similarity of the fiducial marks",
     }[comparison.use]
-    of_what = _counted(comparison.same) if comparison.trend is None else "twice the smaller one of two tests"
+    same, trend = comparison.same, comparison.trend
+    counted = f"chi-square {same.chi_square:.1f}, {same.freedom} degrees of freedom"
+    of_what = counted if trend is None else "twice the smaller one of two tests"
     sentence = (
         f"p = {comparison.probability:.2g} for an unchanged camera "
         f"({of_what}; drift: p < {level:g}), after adjustment of {taken}."
     )
-    if comparison.trend is None:
+    if trend is None:
         return sentence
     first, last = comparison.calibrations[0].name, comparison.calibrations[-1].name
     return (
-        f"{sentence} All equal: p = {comparison.same.probability:.2g} ({_counted(comparison.same)}). No "
-        f"linear change with time: p = {comparison.trend.probability:.2g} ({_counted(comparison.trend)}); from {first} "
-        f"to {last} it is {_rms(comparison.trend_um):.2f} µm rms over the frame, "
+        f"{sentence} All equal: p = {same.probability:.2g} ({counted}). No linear change with time: "
+        f"p = {trend.probability:.2g} (chi-square {trend.chi_square:.1f}, {trend.freedom} degrees of freedom); from "
+        f"{first} to {last} it is {_rms(comparison.trend_um):.2f} µm rms over the frame, "
         f"{_largest(comparison.trend_um, comparison.trend_covariance_um2)}."
     )
-
-
-def _counted(test: Test) -> str:
-    return f"chi-square {test.chi_square:.1f}, {test.freedom} degrees of freedom"
 
 
 def _print_difference(
@@ -236,20 +234,17 @@ def _panel(title: str, field_um: Array, covariance_um2: Array, starts: Array, px
     radii_um, angles = svg.ellipse_axes(covariance_um2)
     (left, top), (right, bottom) = starts.min(axis=0) - 24.0, starts.max(axis=0) + 24.0
     um = svg.round_step(_LONGEST * (right - left) / px_per_um)
+    is_within = (np.hypot(*field_um.T) < radii_um.min(axis=1)).all()
+    remark = "; no arrow is longer than its ellipse" if is_within else ""
     return (
         svg.words(left, 24.0, title, "label"),
-        svg.words(left, 42.0, f"longest arrow {_longest(field_um):.2f} µm{_within(field_um, radii_um)}", "tick"),
+        svg.words(left, 42.0, f"longest arrow {_longest(field_um):.2f} µm{remark}", "tick"),
         svg.tag("rect", x=left, y=top, width=right - left, height=bottom - top, class_="frame"),
         *svg.ellipses(ends, px_per_um * radii_um, angles),
         svg.strokes(starts, ends, "vector target"),
         svg.strokes(starts, starts, "dot target"),
         svg.scale_bar(left, bottom + 16.0, um * px_per_um, f"{um:g} µm, ellipses of 95 %"),
     )
-
-
-def _within(field_um: Array, radii_um: Array) -> str:
-    """Remark where each arrow is shorter than the smaller axis of its ellipse."""
-    return "; no arrow is longer than its ellipse" if (np.hypot(*field_um.T) < radii_um.min(axis=1)).all() else ""
 
 
 def _longest(field_um: Array) -> float:

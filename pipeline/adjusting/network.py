@@ -24,17 +24,15 @@ from pipeline.files.project_tables import UNITS_MM, AdjustSettings
 from pipeline.files.target_table import TieSettings
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.wording import did_you_mean, listed
-from pipeline.types import Array
 
 OTHER_UNIT = 5.0  # ratio of lengths: film and paper deform by some percent; the nearest other unit (cm) is 10
-
-
-BOARD = "board"
 FEWEST_TARGETS = 3  # in an image without observed exterior orientation
 
 
-def check_fiducials(project: Project, marks: Sequence[ComparatorPoint]) -> None:
-    """Raise InputError for fiducials that the camera lacks, and for coordinates that are not in mm."""
+def _check_marks(project: Project, marks: Sequence[ComparatorPoint]) -> None:
+    """Raise InputError for fiducials that the camera lacks, for coordinates that are not in mm, and for targets that
+    are not among the given points, if there are any."""
+    comparator, points = project.comparator, project.object_points
     shown = defaultdict[str, list[ComparatorPoint]](list)
     for mark in marks:
         if mark.kind == "fiducial":
@@ -45,24 +43,27 @@ def check_fiducials(project: Project, marks: Sequence[ComparatorPoint]) -> None:
         for mark in own:
             if mark.point not in ids:
                 raise InputError(
-                    f"{project.comparator}, line {mark.line}: image {image!r}: {camera.path} has no fiducial "
+                    f"{comparator}, line {mark.line}: image {image!r}: {camera.path} has no fiducial "
                     f"{mark.point!r}. It has {', '.join(ids) or 'none'}."
                 )
-        if not project.scans:
-            _check_fiducial_unit(project.comparator, camera, own)
-
-
-def _check_fiducial_unit(comparator: Path, camera: CameraFile, marks: Sequence[ComparatorPoint]) -> None:
-    """Compare extents: in µm, inches or pixels they differ from the camera's by more than film deformation."""
-    given = {one.id: one.xy_mm for one in camera.fiducials if max(one.sigma_mm) < math.inf}
-    known = [(mark.xy_mm, given[mark.point]) for mark in marks if mark.xy_mm is not None and mark.point in given]
-    diagonals = np.hypot(*np.ptp(np.array(known), axis=0).T).tolist() if known else [0.0, 0.0]  # measured, given
-    if all(diagonals) and not 1 / OTHER_UNIT < diagonals[0] / diagonals[1] < OTHER_UNIT:
-        raise InputError(
-            f"{comparator}, line {marks[0].line}: the fiducials of image {marks[0].image!r} stand "
-            f"{diagonals[0] / diagonals[1]:.3g} times as far apart as those of {camera.path}. Give both in mm: not in "
-            "µm, inches or pixels."
-        )
+        # In µm, inches or pixels the extent differs from the camera's by more than film deformation.
+        given = {one.id: one.xy_mm for one in camera.fiducials if max(one.sigma_mm) < math.inf}
+        known = [(mark.xy_mm, given[mark.point]) for mark in own if mark.xy_mm is not None and mark.point in given]
+        diagonals = np.hypot(*np.ptp(np.array(known), axis=0).T).tolist() if known else [0.0, 0.0]  # measured, given
+        is_checked = not project.scans and all(diagonals)
+        if is_checked and not 1 / OTHER_UNIT < diagonals[0] / diagonals[1] < OTHER_UNIT:
+            raise InputError(
+                f"{comparator}, line {own[0].line}: the fiducials of image {image!r} stand "
+                f"{diagonals[0] / diagonals[1]:.3g} times as far apart as those of {camera.path}. Give both in mm: not "
+                "in µm, inches or pixels."
+            )
+    for mark in marks:
+        if mark.kind == "target" and points and mark.point not in points:
+            raise InputError(
+                f"{comparator}, line {mark.line}: image {mark.image!r} shows the target {mark.point!r}, which "
+                f"the given points do not hold.{did_you_mean(mark.point, points)} Add it to them (coordinates may be "
+                "blank), or make it a point of kind tie."
+            )
 
 
 def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[Network, tuple[str, ...]]:
@@ -79,9 +80,8 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
             f"{project.comparator}: holds no observation: no mark has the status measured or weak.{why} "
             "The reasons of all stand in its last column."
         )
-    check_fiducials(project, used)
+    _check_marks(project, used)
     comparator, given = project.comparator, project.object_points
-    _check_points(comparator, given, used)
     by_name = {name: _image(project, name) for name in dict.fromkeys(mark.image for mark in used)}
     used, unjoined = _joinable(comparator, by_name, used)
     used, lonely = _locatable(given, by_name, used)
@@ -286,17 +286,6 @@ def _transformation(project: Project, camera: CameraFile) -> Transformation:
     return given
 
 
-def _check_points(comparator: Path, given: Mapping[str, ObjectPoint], marks: Sequence[ComparatorPoint]) -> None:
-    """Raise InputError for a target, not a tie point, that is not among the given points, if there are any."""
-    for mark in marks:
-        if mark.kind == "target" and given and mark.point not in given:
-            raise InputError(
-                f"{comparator}, line {mark.line}: image {mark.image!r} shows the target {mark.point!r}, which "
-                f"the given points do not hold.{did_you_mean(mark.point, given)} Add it to them (coordinates may be "
-                "blank), or make it a point of kind tie."
-            )
-
-
 def _cameras(
     project: Project, images: Sequence[Image], marks: Sequence[ComparatorPoint]
 ) -> tuple[tuple[Camera, ...], tuple[Calibration, ...]]:
@@ -337,7 +326,7 @@ def _boards(project: Project) -> tuple[Board, ...]:
         for point in project.object_points.values()
     }
     try:
-        return (Board(BOARD, {id_: xyz for id_, xyz in flat.items() if len(xyz) == 3}, (Prior(0.0, sigma),) * 2),)
+        return (Board("board", {id_: xyz for id_, xyz in flat.items() if len(xyz) == 3}, (Prior(0.0, sigma),) * 2),)
     except ValueError as error:
         raise InputError(
             f"{project.path}: board_bend is given, but the object points are no board: {error}. Leave it out, or give "
@@ -368,21 +357,19 @@ def _distances(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[tupl
 
 
 def _observations(settings: AdjustSettings, marks: Sequence[ComparatorPoint]) -> Observations:
+    """Observed marks; covariances, measured or a priori, with the variance of film and scanner added."""
+    covariances_mm2 = []
+    for mark in marks:
+        if mark.sigma_mm is None:
+            sigma_um = settings.sigma_fiducial_um if mark.kind == "fiducial" else settings.sigma_target_um
+            own_mm2 = np.eye(2) * (sigma_um / 1000.0) ** 2
+        else:
+            own_mm2 = np.outer(mark.sigma_mm, mark.sigma_mm) * np.array([[1.0, mark.rho], [mark.rho, 1.0]])
+        covariances_mm2.append(own_mm2 + np.eye(2) * (settings.film_sigma_um / 1000.0) ** 2)
     return Observations(
         image=tuple(mark.image for mark in marks),
         point=tuple(mark.point for mark in marks),
         kind=tuple(mark.kind for mark in marks),
         xy_mm=np.array([mark.xy_mm for mark in marks], dtype=np.float64),
-        covariance_mm2=np.array([_covariance(settings, mark) for mark in marks]),
+        covariance_mm2=np.array(covariances_mm2),
     )
-
-
-def _covariance(settings: AdjustSettings, mark: ComparatorPoint) -> Array:
-    """Covariance of a mark, or the a-priori one, plus the variance of film and scanner, mm²."""
-    if mark.sigma_mm is None:
-        sigma_um = settings.sigma_fiducial_um if mark.kind == "fiducial" else settings.sigma_target_um
-        covariance = np.eye(2) * (sigma_um / 1000.0) ** 2
-    else:
-        covariance = np.outer(mark.sigma_mm, mark.sigma_mm) * np.array([[1.0, mark.rho], [mark.rho, 1.0]])
-    film: Array = covariance + np.eye(2) * (settings.film_sigma_um / 1000.0) ** 2
-    return film

@@ -19,7 +19,16 @@ def rotate_to_sensor(project: Project, marks: Sequence[ComparatorPoint]) -> list
 
     Raises InputError where the size of a rotated image is unknown.
     """
-    return [_turned_back(project, mark) if project.turned_deg(mark.image) else mark for mark in marks]
+    rotated = []
+    for mark in marks:
+        if mark.xy_mm is not None and project.turned_deg(mark.image):
+            turned_deg, last_mm = picture_turn(project, mark.image)
+            if turned_deg != 180:
+                sigma_mm = None if mark.sigma_mm is None else mark.sigma_mm[::-1].copy()
+                mark = replace(mark, sigma_mm=sigma_mm, rho=-mark.rho)
+            mark = replace(mark, xy_mm=turned_back(mark.xy_mm, turned_deg, last_mm))
+        rotated.append(mark)
+    return rotated
 
 
 def turned_back(xy_mm: Array, turned_deg: int, last_mm: tuple[float, float]) -> Array:
@@ -41,12 +50,8 @@ def turned_forth(xy_mm: Array, turned_deg: int, last_mm: tuple[float, float]) ->
 def picture_turn(project: Project, image: str) -> Turn:
     """Rotation of an image, for `turned_back`. Raises InputError where the size of a rotated image is unknown."""
     turned_deg = project.turned_deg(image)
-    return (turned_deg, sensor_size_mm(project, image)) if turned_deg else NOT_TURNED
-
-
-def sensor_size_mm(project: Project, image: str) -> tuple[float, float]:
-    """Distances from the first to the last pixel of a row and of a column of the sensor, mm. Raises InputError where
-    they are unknown."""
+    if not turned_deg:
+        return NOT_TURNED
     camera, pitch_um = project.image_camera(image), project.pitch_um
     if camera.frame_mm is None or pitch_um is None:
         raise InputError(
@@ -54,15 +59,4 @@ def sensor_size_mm(project: Project, image: str) -> tuple[float, float]:
             f"picture: give frame_mm in {camera.path} and pitch_um in {project.path}."
         )
     (width, height), (across, down) = camera.frame_mm, pitch_um
-    return width - across / 1000.0, height - down / 1000.0
-
-
-def _turned_back(project: Project, mark: ComparatorPoint) -> ComparatorPoint:
-    if mark.xy_mm is None:
-        return mark
-    turned_deg, last_mm = picture_turn(project, mark.image)
-    xy_mm = turned_back(mark.xy_mm, turned_deg, last_mm)
-    if turned_deg == 180:
-        return replace(mark, xy_mm=xy_mm)
-    sigma_mm = None if mark.sigma_mm is None else mark.sigma_mm[::-1].copy()
-    return replace(mark, xy_mm=xy_mm, sigma_mm=sigma_mm, rho=-mark.rho)
+    return turned_deg, (width - across / 1000.0, height - down / 1000.0)

@@ -55,7 +55,11 @@ def measure_again(
     settings = project.targets
     if settings is None or settings.board is not None or not adjustment.converged:
         return None
-    field = _adjusted_field(target_field(project), adjustment)
+    field = target_field(project)
+    known = [row for row, id in enumerate(field.ids) if id in adjustment.network.point_by_id]
+    xyz = field.xyz.copy()
+    xyz[known] = adjusted_places(adjustment, [field.ids[row] for row in known])
+    field = replace(field, xyz=xyz)
     visits = [
         SearchedAgain(scan.frame.image, fetch_location(scan.scan), missed, settings, project.max_pixels)
         for scan in scans
@@ -84,27 +88,27 @@ def looked_again(visit: SearchedAgain) -> tuple[MarkMeasurement, ...] | str:
     return tuple(mark for mark in marks if mark.status.is_observation)
 
 
-def _adjusted_field(field: Field, adjustment: Adjustment) -> Field:
-    """Target field at its adjusted coordinates."""
-    xyz = field.xyz.copy()
-    known = [row for row, id in enumerate(field.ids) if id in adjustment.network.point_by_id]
-    xyz[known] = adjusted_places(adjustment, [field.ids[row] for row in known])
-    return replace(field, xyz=xyz)
-
-
 def _missed(
     field: Field, scan: MeasuredScan, adjustment: Adjustment, settings: TargetSettings
 ) -> tuple[TargetPrediction, ...]:
-    """Predictions of the targets that were missed in a scan."""
+    """Predictions of the targets that were missed in a scan; not of those that a person decided about."""
     network, image = adjustment.network, scan.frame.image
     if image not in network.image_by_name or image in network.unoriented:
         return ()
-    targets = {mark.point: mark for mark in scan.frame.marks if mark.kind not in ON_FILM}
+    found = {
+        mark.point
+        for mark in scan.frame.marks
+        if mark.kind not in ON_FILM
+        if mark.status.is_observation
+        or Code.DECIDED in mark.reason.codes
+        # At the place of a rejected coded target is another one's ring.
+        or (settings.code is not None and mark.status is Status.REJECTED)
+    }
     return tuple(
         one
         for one in field.predictions(adjusted_image(adjustment, image), scan, _SEARCH_PX)
         if 0 <= one.center_px[0] < scan.width_px and 0 <= one.center_px[1] < scan.height_px
-        if _is_missed(targets.get(one.point), settings)
+        if one.point not in found
     )
 
 
@@ -117,25 +121,15 @@ def _visited(
         return scan.changed(problems=[problem])
     targets = {mark.point: mark for mark in scan.frame.marks if mark.kind not in ON_FILM}
     taken = [mark.center_px for mark in targets.values() if mark.status.is_observation and mark.center_px is not None]
-    fresh = {mark.point: mark for mark in seen if _is_free(mark, np.array(taken).reshape(-1, 2))}
+    taken_px = np.array(taken).reshape(-1, 2)  # places at which another target has been measured
+    fresh = {
+        mark.point: mark
+        for mark in seen
+        if mark.center_px is not None and not (np.hypot(*(taken_px - mark.center_px).T) < _SEARCH_PX).any()
+    }
     if not fresh:
         return scan
     model = adjusted_image(adjustment, scan.frame.image)
     checked = checked_places(tuple((targets | fresh).values()), field, model, scan)
     fresh = {mark.point: mark for mark in checked if mark.point in fresh and mark.status.is_observation}
     return replace_targets(scan, tuple((targets | fresh).values())) if fresh else scan
-
-
-def _is_missed(mark: MarkMeasurement | None, settings: TargetSettings) -> bool:
-    """Whether a target is to be sought again; not one that a person decided about."""
-    if mark is None:
-        return True
-    if Code.DECIDED in mark.reason.codes:
-        return False
-    # At the place of a rejected coded target is another one's ring.
-    return not mark.status.is_observation and not (settings.code is not None and mark.status is Status.REJECTED)
-
-
-def _is_free(mark: MarkMeasurement, taken_px: np.ndarray) -> bool:
-    """Whether no other target has been measured at the place of a mark."""
-    return mark.center_px is not None and not bool((np.hypot(*(taken_px - mark.center_px).T) < _SEARCH_PX).any())
