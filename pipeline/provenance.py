@@ -134,7 +134,15 @@ class FileStates:
 
     def get(self, path: str | Path) -> FileState:
         """State of a file or an object; one that does not respond counts as missing."""
-        uri = str(path) if isinstance(path, Address) else self._relative(str(path))
+        uri = str(path)
+        if not isinstance(path, Address):
+            parent, sign, name = uri.rpartition(os.sep)
+            if parent not in self._below:
+                folder = os.path.abspath(parent + sign)
+                with suppress(ValueError):  # on another drive
+                    folder = os.path.relpath(folder, self._folder)
+                self._below[parent] = "" if folder == os.curdir else f"{Path(folder).as_posix().removesuffix('/')}/"
+            uri = self._below[parent] + name
         try:
             if isinstance(path, Address):
                 return FileState(uri, path.stat().st_size, etag=path.etag)
@@ -142,16 +150,6 @@ class FileStates:
         except (OSError, MissingError, UnreachableError):
             return FileState(uri, -1)
         return FileState(uri, stat.st_size, stat.st_mtime_ns)
-
-    def _relative(self, path: str) -> str:
-        """Path relative to the project's folder if possible, with `/`."""
-        parent, sign, name = path.rpartition(os.sep)
-        if parent not in self._below:
-            folder = os.path.abspath(parent + sign)
-            with suppress(ValueError):  # on another drive
-                folder = os.path.relpath(folder, self._folder)
-            self._below[parent] = "" if folder == os.curdir else f"{Path(folder).as_posix().removesuffix('/')}/"
-        return self._below[parent] + name
 
 
 def file_state(path: Path, folder: Path) -> FileState:

@@ -36,7 +36,6 @@ class Unpublished:
         self._output, self._comparator = output, comparator
         self.folder = output / f".unfinished.{socket.gethostname()}.{os.getpid()}"
         self._removed: list[Path] = []
-        self._is_output_new = not output.exists()
 
     def place(self, path: Path) -> Path:
         """Temporary path of the result that will be published at `path`."""
@@ -80,20 +79,6 @@ class Unpublished:
             except WriteError as error:
                 raise WriteError(f"{error} New are: {', '.join(done) or 'none'}. Run it again.") from error
 
-    def spoken(self, text: str) -> str:
-        """Message with final instead of temporary paths."""
-        comparator = self._comparator
-        return text.replace(str(self.place(comparator)), str(comparator)).replace(f"{self.folder.name}{os.sep}", "")
-
-    def discard(self) -> None:
-        """Delete everything that was not published, and a new output folder that nothing was published to."""
-        shutil.rmtree(self.folder, ignore_errors=True)
-        if self._is_output_new:
-            with suppress(OSError):  # it is not empty
-                self._output.rmdir()
-        with suppress(OSError):
-            self.place(self._comparator).unlink(missing_ok=True)
-
 
 @contextmanager
 def unpublished(project: Project) -> Iterator[Unpublished]:
@@ -104,19 +89,26 @@ def unpublished(project: Project) -> Iterator[Unpublished]:
     for path in project.results:
         _check_replaceable(path, project.comparator)
     _clear({project.output, project.comparator.parent})
-    new = Unpublished(project.output, project.comparator)
+    new, is_output_new = Unpublished(project.output, project.comparator), not project.output.exists()
+    place = new.place(project.comparator)
     try:
         with writing(project.output):
             new.folder.mkdir(parents=True, exist_ok=True)
         if project.scans:
             with writing(project.comparator):
-                new.place(project.comparator).touch()
-                new.place(project.comparator).unlink()
+                place.touch()
+                place.unlink()
         yield new
-    except WriteError as error:
-        raise WriteError(new.spoken(str(error))) from error
+    except WriteError as error:  # names the final paths, not the temporary ones
+        text = str(error).replace(str(place), str(project.comparator))
+        raise WriteError(text.replace(f"{new.folder.name}{os.sep}", "")) from error
     finally:
-        new.discard()
+        shutil.rmtree(new.folder, ignore_errors=True)
+        if is_output_new:
+            with suppress(OSError):  # it is not empty
+                project.output.rmdir()
+        with suppress(OSError):
+            place.unlink(missing_ok=True)
 
 
 @contextmanager

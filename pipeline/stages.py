@@ -9,7 +9,6 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from adjust.solution.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
@@ -19,8 +18,9 @@ from pipeline.archive.checked_results import Judging, measured_scans, read_measu
 from pipeline.archive.made_from import adjusted_from, differing
 from pipeline.archive.results_database import Merged, Store, check_mergeable, merge
 from pipeline.archive.schema import DamagedError
-from pipeline.archive.status import archive_status
+from pipeline.archive.status import ArchiveStatus, archive_status
 from pipeline.archive.thumbnails import Thumbnails, ThumbnailStore
+from pipeline.archive.verdicts import Verdict
 from pipeline.errors import InputError, WriteError
 from pipeline.files.object_files import WRITTEN, fill_images
 from pipeline.files.project_file import Project
@@ -34,11 +34,8 @@ from pipeline.results import comparator_file
 from pipeline.results.adjustment_file import covariance_path, read_adjustment, write_adjustment
 from pipeline.results.measured_record import MeasuredScan, for_images, write_frames
 from pipeline.results.record_json import write_record
-from pipeline.summary import Summary, archive_summary, shard_summary, summarise
+from pipeline.summary import Summary, archive_summary, summarise
 from pipeline.workers import NotMeasured, WorkOptions
-
-if TYPE_CHECKING:
-    from pipeline.opencv_check.check import BoardPictures
 
 _ONE_BY_ONE = 2000  # scans; for more, the summary is read from the store: totals and what needs a look
 
@@ -77,10 +74,13 @@ def run_measure(project: Project, reporter: Reporter, work: WorkOptions | None =
     """Measure scans into comparator.csv; a shard only into its own store, for `reseau merge`."""
     with _running(project, reporter, work) as run:
         if work is not None and work.shard is not None:
-            path = project.shard_path(*work.shard)
+            part, parts = work.shard
+            path = project.shard_path(part, parts)
             with Store(path) as store:
                 run.measure_into(store)
-            return shard_summary(project, path, work.shard)
+            scans = archive_status(project, path).scans
+            own = tuple(scan for scan in scans if scan.verdict not in (Verdict.WAITING, Verdict.OLD))
+            return replace(archive_summary(ArchiveStatus(own), {f"part {part} of {parts}": path}), parts=parts)
         digest = run.measure()
         data = measured_data(project, run.new.current_path) if len(project.scans) <= _ONE_BY_ONE else None
         run.publish()
@@ -285,44 +285,34 @@ class _Run:
             fill_images(self.project.images_path, for_images(scans, WRITTEN))
 
     def write_adjustment(self, adjustment: Adjustment, marks: Sequence[comparator_file.ComparatorPoint]) -> None:
-        made_from = adjusted_from(self.project, marks)
-        write_adjustment(adjustment, self.new.place(self.project.adjustment_path), made_from, self._frames_mm())
-
-    def _frames_mm(self) -> dict[str, tuple[float, float]]:
-        """{camera: size of its frame, mm}; for a camera without fiducials and frame size, that of its largest image."""
         project = self.project
-        largest: dict[str, tuple[float, float]] = {}
         with self._judging() as judging:
             sizes = judging.sizes_mm() if judging is not None else {}
+        frames_mm: dict[str, tuple[float, float]] = {}  # by camera; without fiducials and frame size, its largest image
         for image, size in sizes.items():
             camera = project.image_camera(image)
             if not camera.fiducials:
-                largest[camera.name] = max(largest.get(camera.name, size), size)
-        return largest | {each.name: each.frame_mm for each in project.cameras.values() if each.frame_mm is not None}
+                frames_mm[camera.name] = max(frames_mm.get(camera.name, size), size)
+        frames_mm |= {each.name: each.frame_mm for each in project.cameras.values() if each.frame_mm is not None}
+        path = self.new.place(project.adjustment_path)
+        write_adjustment(adjustment, path, adjusted_from(project, marks), frames_mm)
 
     def write_check(self, adjustment: Adjustment) -> None:
-        from pipeline.opencv_check.check import check_against_opencv
+        from pipeline.opencv_check.check import BoardPictures, check_against_opencv, detector_name
 
-        path = self.project.adjustment_path
-        found = check_against_opencv(adjustment, self._board_pictures())
+        project, path, pictures = self.project, self.project.adjustment_path, None
+        board = project.targets.board if project.targets else None
+        if board is not None and project.scans and detector_name(board):
+            pitch_um = comparator_file.read_pitches(self.new.current_path(project.comparator))
+            if project.pitch_um:
+                pitch_um = dict.fromkeys(project.scans, project.pitch_um) | pitch_um
+            images = project.given_images.turned_deg if project.given_images else {}
+            turned = {image: picture_turn(project, image) for image in images}
+            pictures = BoardPictures(board, project.open_scan, pitch_um, turned)
+        found = check_against_opencv(adjustment, pictures)
         made_from = {path.name: hash_file(self.new.current_path(path))}
         content = replace(found, reseau=version("reseau"), made_from=made_from)
-        write_record(content, self.new.place(self.project.check_path))
-
-    def _board_pictures(self) -> "BoardPictures | None":
-        """Images of the board for OpenCV; None where there is no scan, or OpenCV has no detector for it."""
-        from pipeline.opencv_check.check import BoardPictures, detector_name
-
-        project = self.project
-        board = project.targets.board if project.targets else None
-        if board is None or not project.scans or not detector_name(board):
-            return None
-        pitch_um = comparator_file.read_pitches(self.new.current_path(project.comparator))
-        if project.pitch_um:
-            pitch_um = dict.fromkeys(project.scans, project.pitch_um) | pitch_um
-        images = project.given_images.turned_deg if project.given_images else {}
-        turned = {image: picture_turn(project, image) for image in images}
-        return BoardPictures(board, project.open_scan, pitch_um, turned)
+        write_record(content, self.new.place(project.check_path))
 
     def report(self) -> Summary:
         """Write the report of what has been measured and adjusted."""

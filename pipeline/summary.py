@@ -2,7 +2,7 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from itertools import groupby
 from operator import attrgetter
@@ -15,9 +15,8 @@ from rich.text import Text
 
 from measure.flags import Status
 from measure.results import ScanOrientation
-from pipeline.archive.status import NAMED, ArchiveStatus, archive_status, worst_named
+from pipeline.archive.status import NAMED, ArchiveStatus, worst_named
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_counts
-from pipeline.files.project_file import Project
 from pipeline.report.data import Problem, ReportData, current_scans
 from pipeline.report.data import frames as report_frames
 from pipeline.report.fiducials import Distance, correction_sentence, figure
@@ -27,7 +26,7 @@ from pipeline.report.parameters import CameraValue, camera_values
 from pipeline.report.verdict import Level, ReportVerdict, judge, sigma0_bounds
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit
-from pipeline.results.measured_record import pose_record
+from pipeline.results.measured_record import plain_json
 from pipeline.results.stage_files import Check
 from pipeline.text.wording import counted
 
@@ -82,7 +81,7 @@ class Summary:
             "problems": [{"what": problem.what, "next_step": problem.next_step} for problem in self.verdict.problems],
             "notes": list(self.verdict.notes),
             "frames": {name: dict(counts) for name, counts in self.frames.items()},
-            "poses": {name: pose_record(pose) for name, pose in self.poses.items()},
+            "poses": {name: plain_json(pose) for name, pose in self.poses.items()},
             "adjustment": self.adjustment
             and {name: getattr(self.adjustment, name) for name in _MAIN}
             | {"sigma0_from": self.adjustment.variance_factor, "cameras": self.adjustment.cameras},
@@ -97,30 +96,26 @@ def summarise(data: ReportData, files: Mapping[str, Path]) -> Summary:
     for mark in data.comparator:
         marks[mark.image][mark.status] += 1
     of_frames = data.totals.marks if data.totals else marks
-    cameras = data.adjustment.cameras if data.adjustment else {}
+    stored, covariance = data.adjustment, data.covariance
+    cameras = stored.cameras if stored else {}
+    corrections = dict[str, tuple[str, Sequence[Distance]]]()
+    if stored is not None and covariance is not None and stored.converged:
+        for name, camera in cameras.items():
+            if not camera.is_calibrated and (form := figure(name, stored, covariance)) is not None:
+                sentence = correction_sentence(form, camera.fiducials, data.coordinates_source(name))
+                corrections[name] = sentence, form.distances
     return Summary(
         judge(data),
         {name: {str(s): counts.get(s, 0) for s in Status} for name, counts in of_frames.items()},
         {name: scan.frame.pose for name, scan in current_scans(data).items() if scan.frame.pose},
-        data.adjustment,
+        stored,
         data.check,
         files,
-        corrections=_corrections(data),
+        corrections=corrections,
         values={name: camera_values(data, name) for name, camera in cameras.items() if camera.is_calibrated},
         unit=next(iter(data.image_units.values()), FILM_UNIT),
         verdicts=frame_counts(data, report_frames(data)) if data.measurement is not None else {},
     )
-
-
-def _corrections(data: ReportData) -> dict[str, tuple[str, Sequence[Distance]]]:
-    stored, covariance = data.adjustment, data.covariance
-    if stored is None or covariance is None or not stored.converged:
-        return {}
-    return {
-        name: (correction_sentence(form, camera.fiducials, data.coordinates_source(name)), form.distances)
-        for name, camera in stored.cameras.items()
-        if not camera.is_calibrated and (form := figure(name, stored, covariance)) is not None
-    }
 
 
 def print_summary(summary: Summary, console: Console) -> None:
@@ -172,7 +167,10 @@ def _verdict_figures(summary: Summary) -> str:
 
 def _frame_table(summary: Summary) -> Table:
     """Table of marks and residuals by frame, the worst first, without empty columns."""
-    frames, poses, rms = summary.frames, summary.poses, _rms_um(summary.adjustment)
+    frames, poses, squares = summary.frames, summary.poses, defaultdict[str, list[float]](list)
+    for residual in summary.adjustment.residuals if summary.adjustment else ():
+        squares[residual.image] += [residual.vx_um**2, residual.vy_um**2]
+    rms = {name: float(np.sqrt(np.mean(each))) for name, each in squares.items()}
     lost = {name: sum(counts.values()) - counts[Status.MEASURED] for name, counts in frames.items()}
     is_lost = {name: not (counts[Status.MEASURED] or counts[Status.WEAK]) for name, counts in frames.items()}
     worst = sorted(frames, key=lambda name: (is_lost[name], rms.get(name, 0.0), lost[name]), reverse=True)
@@ -190,14 +188,6 @@ def _frame_table(summary: Summary) -> Table:
             row.append("" if known is None else f"{known * summary.unit.per_um:.{summary.unit.decimals}f}")
         table.add_row(Text(name), *row)
     return table
-
-
-def _rms_um(adjustment: AdjustmentRecord | None) -> dict[str, float]:
-    """{frame: rms of the residuals per axis, µm}."""
-    squares: dict[str, list[float]] = defaultdict(list)
-    for row in adjustment.residuals if adjustment else ():
-        squares[row.image] += [row.vx_um**2, row.vy_um**2]
-    return {name: float(np.sqrt(np.mean(each))) for name, each in squares.items()}
 
 
 def _camera_table(adjustment: AdjustmentRecord, values: Mapping[str, Sequence[CameraValue]]) -> Table:
@@ -219,14 +209,6 @@ def _quality(adjustment: AdjustmentRecord) -> str:
     if not adjustment.has_sigma0:
         return "standard deviations a priori"
     return f"sigma0 {adjustment.sigma0:.3f}, redundancy {adjustment.variance_factor.redundancy:.0f}"
-
-
-def shard_summary(project: Project, path: Path, shard: tuple[int, int]) -> Summary:
-    """Summary of a measured shard."""
-    status = archive_status(project, path)
-    own = tuple(scan for scan in status.scans if scan.verdict not in (Verdict.WAITING, Verdict.OLD))
-    summary = archive_summary(ArchiveStatus(own), {f"part {shard[0]} of {shard[1]}": path})
-    return replace(summary, parts=shard[1])
 
 
 def archive_summary(status: ArchiveStatus, files: Mapping[str, Path]) -> Summary:

@@ -15,11 +15,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
-from adjust.problem.observations import ObservationKind
 from measure.flags import Code, Reason, Status
 from measure.results import FrameMeasurement
 from pipeline.archive import schema
@@ -27,13 +26,12 @@ from pipeline.archive.results_database import Store
 from pipeline.archive.verdicts import Verdict, scan_doubt, scan_verdict
 from pipeline.errors import InputError
 from pipeline.provenance import hash_file
-from pipeline.results.comparator_file import CameraPerson, ComparatorPoint, read_measurement_hash
+from pipeline.results.comparator_file import KINDS, CameraPerson, ComparatorPoint, read_measurement_hash
 from pipeline.results.measured_record import (
     Failure,
     FailureCode,
     MeasuredScan,
     mark_row,
-    read_mark_row,
     read_scan,
     scan_detail,
     scan_location,
@@ -114,7 +112,7 @@ class Judging:
                 if rows is None:
                     raise ValueError
                 detail = json.loads(measured) | json.loads(changed or "{}")
-                yield read_scan(name, detail, list(map(read_mark_row, rows)), scan_location(uri, folder))
+                yield read_scan(name, detail, rows, scan_location(uri, folder))
             except (ValueError, TypeError, KeyError):
                 sentence = str(schema.damaged_result(name, self.store.path))
                 frame = FrameMeasurement(name, (), problems=(Reason(sentence, Code.FAILED_SCAN),))
@@ -136,7 +134,7 @@ class Judging:
                 if (px2 := _covariance(spread, causes)) is not None:
                     sigma_mm = np.sqrt(px2[:2]) * (across_um, down_um) / 1000.0
                     rho = -px2[2] / math.sqrt(px2[0] * px2[1])
-                yield ComparatorPoint(name, point, _KINDS[kind], xy_mm, sigma_mm, rho, Status(status), reason)
+                yield ComparatorPoint(name, point, KINDS[kind], xy_mm, sigma_mm, rho, Status(status), reason)
 
     def _frames(
         self, columns: str, images: Collection[str] | None
@@ -197,7 +195,6 @@ class Judging:
         return judge(self.store, self.made_from, f"second pass {self.input}", frames)
 
 
-_KINDS: dict[str, ObservationKind] = {kind: kind for kind in get_args(ObservationKind)}
 _PLAIN = """
 select name, uri, result from checked_frame where judging = ?1 and verdict = ?2 and result not in (
     select result from checked_mark where judging = ?1 and kind <> 'fiducial'

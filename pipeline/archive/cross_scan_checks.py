@@ -8,7 +8,7 @@ from importlib.metadata import version
 from measure.flags import Code, Reason, Status
 from measure.results import MEASURE_REVISION
 from measure.scans.remote import scan_path
-from pipeline.archive.checked_results import CheckedResult, Lot
+from pipeline.archive.checked_results import Lot
 from pipeline.archive.results_database import Store
 from pipeline.archive.work import Work
 from pipeline.files.camera_file import CameraFile
@@ -51,7 +51,7 @@ def check_lots(
             for name, of_decisions in ((task.name, work.decisions_hash(task.name)) for task in some)
         ]
         inputs = fingerprint([results, depends_on, _MADE_BY])
-        return Lot(inputs, lambda: (_checked_result(scan, work) for scan in scans()))
+        return Lot(inputs, lambda: map(work.checked_result, scans()))
 
     def checked_lot(of_cameras: Sequence[OfCamera]) -> Iterable[MeasuredScan]:
         scans = [scan for each in of_cameras for scan in _check_camera(project, *each, work)]
@@ -103,10 +103,20 @@ def hash_inputs(tasks: Sequence[ScanTask], work: Work, copies: Mapping[str, str]
     return fingerprint([results, sorted(copies.items()), made_from, _MADE_BY])
 
 
-def _lots(project: Project, tasks: Sequence[ScanTask]) -> Sequence[Sequence[OfCamera]]:
-    """Scans that are checked together, by camera."""
+def _lots(project: Project, tasks: Sequence[ScanTask]) -> list[list[OfCamera]]:
+    """Scans that are checked together, by camera, at most `_TOGETHER` of each."""
+    of_cameras = list[OfCamera]()
+    for camera in project.cameras.values():
+        own = [task for task in tasks if project.image_camera(task.name) is camera]
+        lots = 1
+        while len(own) > lots * _TOGETHER:
+            lots *= 2
+        # Split by a hash of the frame's name: a new scan changes a single lot, and parts of one frame are in one lot.
+        some = defaultdict[int, list[ScanTask]](list)
+        for task in own:
+            some[shard_number(project.image_frame(task.name), lots)].append(task)
+        of_cameras += [(camera, some[lot]) for lot in sorted(some)]
     # Natural points may link any scans; targets and parts of frames are linked only in small projects.
-    of_cameras = _camera_lots(project, tasks)
     are_few = len(tasks) <= _TOGETHER and (project.targets is not None or project.has_parts)
     return [of_cameras] if project.ties is not None or are_few else [[each] for each in of_cameras]
 
@@ -121,22 +131,6 @@ def _project_inputs(project: Project, tasks: Sequence[ScanTask], input_hash: str
         points,
         [project.scanned_frame(each.name) for each in tasks] if project.has_parts else None,
     ]
-
-
-def _camera_lots(project: Project, tasks: Sequence[ScanTask]) -> list[OfCamera]:
-    """Lots of each camera, of at most `_TOGETHER` scans."""
-    # Split by a hash of the frame's name: a new scan changes a single lot, and parts of one frame are in one lot.
-    found = list[OfCamera]()
-    for camera in project.cameras.values():
-        own = [task for task in tasks if project.image_camera(task.name) is camera]
-        lots = 1
-        while len(own) > lots * _TOGETHER:
-            lots *= 2
-        some = defaultdict[int, list[ScanTask]](list)
-        for task in own:
-            some[shard_number(project.image_frame(task.name), lots)].append(task)
-        found += [(camera, some[lot]) for lot in sorted(some)]
-    return found
 
 
 def _check_camera(
@@ -158,11 +152,6 @@ def _writing_remarks(project: Project, tasks: Sequence[ScanTask], work: Work) ->
         bare |= {scan.frame.image: scan for scan in add_plates(camera, own, project.cameras)}
     noted = note_same_frames([bare[name] for name in names], project.scanned_frame)
     return {scan.frame.image: (scan.frame.problems, scan.notes) for scan in noted if scan.frame.problems or scan.notes}
-
-
-def _checked_result(scan: MeasuredScan, work: Work) -> CheckedResult:
-    name = scan.frame.image
-    return CheckedResult(work.results[name], work.apply_decisions(scan), work.decisions_hash(name))
 
 
 def _copy(scan: MeasuredScan, original: str) -> MeasuredScan:

@@ -22,11 +22,10 @@ DECISIONS = "decisions"
 PLACES = "points, orientations or lenses"
 
 # Fields of a project that are not settings; all others, including future ones, are.
-_FILES = {
+_NO_SETTINGS = {
     "path", "cameras", "scans", "comparator", "output", "given_points", "given_images", "given_distances",
-    "images_path", "decisions", "decisions_cut_short",
+    "images_path", "decisions", "decisions_cut_short", "max_pixels", "crs",
 }  # fmt: skip
-_NO_MATTER = {"max_pixels", "crs"}
 # Fields of a camera that determine where its targets are expected, not what its marks look like.
 _LENS = {
     "principal_distance_mm", "principal_point_mm", "principal_distance_sigma_mm", "principal_point_sigma_mm",
@@ -53,7 +52,7 @@ def measured_from(project: Project) -> MadeFrom:
     ]
 
     return {
-        SETTINGS: fingerprint({name: value for name, value in _settings(project).items() if name != "adjust"}),
+        SETTINGS: fingerprint(_fields_except(project, _NO_SETTINGS | {"adjust"})),
         PLACES: fingerprint(places),
         **({DECISIONS: project.decisions_hash} if project.decisions else {}),
         **{
@@ -89,15 +88,20 @@ def current_adjustment(project: Project, marks: Sequence[ComparatorPoint]) -> Ad
 
 def adjusted_from(project: Project, marks: Sequence[ComparatorPoint]) -> MadeFrom:
     """Inputs of an adjustment: the marks that are observations, the given values, and the settings."""
-    observations = sorted((m.image, m.kind, m.point, *_numbers(m)) for m in marks if m.status.is_observation)
+    observations = []
+    for mark in marks:
+        if mark.status.is_observation:
+            assert mark.xy_mm is not None  # an observation has coordinates
+            sigma_mm = [] if mark.sigma_mm is None else mark.sigma_mm.tolist()
+            observations.append((mark.image, mark.kind, mark.point, *mark.xy_mm.tolist(), *sigma_mm, mark.rho))
     cameras = {name: [camera.camera(), camera.calibration, camera.frame_mm] for name, camera in project.cameras.items()}
     return {
-        MARKS: fingerprint(observations),
+        MARKS: fingerprint(sorted(observations)),
         CAMERAS: fingerprint(cameras),
         POINTS: fingerprint([project.object_points, project.given_points and project.given_points.normals]),
         IMAGES: fingerprint(project.given_images),
         DISTANCES: fingerprint({fingerprint(given.distance) for given in project.given_distances}),
-        SETTINGS: fingerprint(_settings(project)),
+        SETTINGS: fingerprint(_fields_except(project, _NO_SETTINGS)),
     }
 
 
@@ -112,15 +116,6 @@ def _parts(path: Path, known: Mapping[str, Identity], files: FileStates) -> tupl
 def differing(made: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     """Names of the inputs that differ, or exist only in one of the two."""
     return sorted(name for name in made.keys() | now.keys() if made.get(name) != now.get(name))
-
-
-def _numbers(mark: ComparatorPoint) -> tuple[Any, ...]:
-    assert mark.xy_mm is not None  # an observation has coordinates
-    return (*mark.xy_mm.tolist(), *(() if mark.sigma_mm is None else mark.sigma_mm.tolist()), mark.rho)
-
-
-def _settings(project: Project) -> dict[str, object]:
-    return _fields_except(project, _FILES | _NO_MATTER)
 
 
 def _fields_except(value: Any, names: Set[str]) -> dict[str, object]:

@@ -148,13 +148,11 @@ def measure_archive(
         copies = find_copies(store, tasks, work)
         made = measured_from(project)
         input_hash = hash_inputs(tasks, work, copies, made)
-        before = latest(store)
-        if before is not None and before.input == input_hash:
-            tell_inapplicable(learned, before, work.decisions, work.counting)
-            return before
-        share = partial(tie_scans, learned, reporter=reporter, executor=executor)
-        lots = check_lots(learned, tasks, work, copies, share, input_hash)
-        judging = judge_lots(store, made, input_hash, lots)
+        judging = latest(store)
+        if judging is None or judging.input != input_hash:
+            share = partial(tie_scans, learned, reporter=reporter, executor=executor)
+            lots = check_lots(learned, tasks, work, copies, share, input_hash)
+            judging = judge_lots(store, made, input_hash, lots)
         tell_inapplicable(learned, judging, work.decisions, work.counting)
         return judging
 

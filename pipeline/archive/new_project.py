@@ -3,7 +3,7 @@
 import glob
 import os
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,6 @@ import numpy as np
 from rich.console import Console
 
 from measure.errors import MeasurementError
-from measure.scans.opening import ScanHead
 from measure.scans.remote import Address, is_address, scan_path
 from pipeline.archive import scan_groups
 from pipeline.errors import InputError
@@ -209,7 +208,10 @@ def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pi
         where = listed(list(map(str, given)))
         raise InputError("\n".join([f"{where}: no scan of film. SIZE: of a square, as 25mm.", *lines]))
     write_atomically(folder / "project.toml", project_text(new))
-    write_atomically(folder / "images.csv", images_text(new))
+    named = zip(names_below(new.cameras), new.cameras.values(), strict=True)
+    rows = sorted((name, f"{PREFIX}{camera}" if camera else "") for name, camera in named)
+    images = [csv_line(("image", "camera")), *map(csv_line, rows)]
+    write_atomically(folder / "images.csv", "\n".join(images) + "\n")
     return new
 
 
@@ -232,25 +234,26 @@ def project_text(new: NewProject) -> str:
     camera = f"camera = {quoted(PREFIX + usual)}    # of {count} scans; images.csv has each one's own"
     if not usual:
         camera = f'# camera = "camera.toml"    # draw it: {TEMPLATE_COMMAND}'
+    excluded = list[str]()
+    if any((new.folder.absolute() / OUTPUT).is_relative_to(given.absolute()) for given in new.given):
+        excluded.append(f"    {quoted(f'{OUTPUT}/**/*')},    # what the project itself writes")
+    endings = {scan.suffix for scan in cameras}
+    for reason, paths in new.left_out.items():
+        found = [path for path in paths if path.suffix in endings and _has_patterns(path)]
+        excluded += [f"    # {reason}"] if found else []
+        excluded += [f"    {quoted(_relative_name(new.folder, path))}," for path in found]
     lines = [
         "# What `reseau init` found. Paths are relative to it; `reseau template project` shows what may stand in it.",
         "",
         camera,
         f"scans = [{', '.join(quoted(pattern) for pattern in _patterns(new))}]",
-        *_exclude_lines(new),
+        *(["exclude = [", *excluded, "]"] if excluded else []),
         f"output = {quoted(OUTPUT)}",
         "",
         "[object]",
         'images = "images.csv"',
     ]
     return "\n".join(lines) + "\n"
-
-
-def images_text(new: NewProject) -> str:
-    """Content of images.csv."""
-    named = zip(names_below(new.cameras), new.cameras.values(), strict=True)
-    rows = sorted((name, f"{PREFIX}{camera}" if camera else "") for name, camera in named)
-    return "\n".join([csv_line(("image", "camera")), *map(csv_line, rows)]) + "\n"
 
 
 def print_new_project(new: NewProject, console: Console) -> None:
@@ -282,78 +285,54 @@ def _left_out(found: scan_groups.Catalogue) -> dict[str, list[Path]]:
     """{reason: files}."""
     # Without any identified camera, the camera file to be added covers all scans: none is left out for it.
     is_named = any(group.camera for group in found.groups)
-    unknown, digital, whole = list[Path](), list[Path](), list[tuple[Path, ScanHead]]()
+    unknown, digital, namesakes = list[Path](), list[Path](), list[Path]()
+    best = dict[str, tuple[tuple[int, int], Path]]()  # by name in its folder: size and format, scan
     for group in found.groups:
         if group.digital:
             digital += group.paths
-        elif is_named and not group.camera:
+            continue
+        if is_named and not group.camera:
             unknown += group.paths
-        else:
-            whole += [(path, group.head) for path in group.paths if path not in found.unread]
+            continue
+        rank = (group.head.width_px * group.head.height_px, _FORMATS.index(group.head.file_format))
+        for path in group.paths:
+            name = image_name(str(path))
+            if path in found.unread:
+                continue
+            if name in best and rank <= best[name][0]:
+                namesakes.append(path)
+                continue
+            namesakes += [best[name][1]] if name in best else []
+            best[name] = rank, path
     return {
         _BROKEN: [path for path in found.unread if isinstance(path, Address) or path.exists() or path.is_symlink()],
         _COPIES: list(found.copies),
-        _NAMESAKES: _namesakes(whole),
+        _NAMESAKES: namesakes,
         _UNKNOWN: unknown,
         _DIGITAL: digital,
     }
 
 
-def _namesakes(scans: Iterable[tuple[Path, ScanHead]]) -> list[Path]:
-    """Scans for which a better one of the same name exists in their folder."""
-    best = dict[str, tuple[tuple[int, int], Path]]()
-    worse = list[Path]()
-    for path, head in scans:
-        rank = (head.width_px * head.height_px, _FORMATS.index(head.file_format))
-        name = image_name(str(path))
-        if name not in best or rank > best[name][0]:
-            worse += [best[name][1]] if name in best else []
-            best[name] = (rank, path)
-        else:
-            worse.append(path)
-    return worse
-
-
 def _patterns(new: NewProject) -> list[str]:
-    """Patterns of the scans below each given folder for `scans`; one for each spelling of an ending."""
-    patterns = dict[str, None]()
+    """Patterns of the scans below each given folder for `scans`, one for each spelling of an ending; for servers, which
+    cannot be searched, the address of every scan."""
+    patterns, cameras = dict[str, None](), new.cameras
     for given in new.given:
-        if isinstance(given, Address):
-            patterns |= dict.fromkeys(_address_patterns(new, given))
-            continue
         shown = _relative_name(new.folder, given)
-        if not given.is_dir():
+        if not isinstance(given, Address) and not given.is_dir():
             patterns[shown] = None
             continue
+        below = [path for path in cameras if path.is_relative_to(given)]
+        if isinstance(given, Address) and (below == [given] or not _has_patterns(given)):
+            patterns |= dict.fromkeys(_relative_name(new.folder, path) for path in below)
+            continue
         start = "" if shown == "." else f"{glob.escape(shown)}/"
-        endings = {path.suffix for path in new.cameras if path.is_relative_to(given)}
-        patterns |= dict.fromkeys(f"{start}**/*{ending}" for ending in sorted(endings))
+        patterns |= dict.fromkeys(f"{start}**/*{ending}" for ending in sorted({path.suffix for path in below}))
     return list(patterns)
-
-
-def _address_patterns(new: NewProject, given: Address) -> list[str]:
-    """Patterns for stores; for servers, which cannot be searched, the address of every scan."""
-    below = [path for path in new.cameras if path.is_relative_to(given)]
-    if below == [given] or not _has_patterns(given):
-        return [path.location if isinstance(path, Address) else str(path) for path in below]
-    return [f"{glob.escape(given.location)}/**/*{ending}" for ending in sorted({path.suffix for path in below})]
 
 
 def _has_patterns(path: Path) -> bool:
     return not isinstance(path, Address) or str(path).startswith("s3:")
-
-
-def _exclude_lines(new: NewProject) -> list[str]:
-    """Lines of `exclude` with their reasons; the project's own output is excluded, too."""
-    excluded = list[str]()
-    if any((new.folder.absolute() / OUTPUT).is_relative_to(given.absolute()) for given in new.given):
-        excluded += [f"    {quoted(f'{OUTPUT}/**/*')},    # what the project itself writes"]
-    for reason, paths in new.left_out.items():
-        endings = {scan.suffix for scan in new.cameras}
-        found = [path for path in paths if path.suffix in endings and _has_patterns(path)]
-        excluded += [f"    # {reason}"] if found else []
-        excluded += [f"    {quoted(_relative_name(new.folder, path))}," for path in found]
-    return ["exclude = [", *excluded, "]"] if excluded else []
 
 
 def _relative_name(folder: Path, path: Path) -> str:
@@ -361,22 +340,18 @@ def _relative_name(folder: Path, path: Path) -> str:
 
 
 def _place(group: scan_groups.ScanGroup) -> str:
+    """File of a single scan; else the folder, with the form of the group's scans."""
     if len(group.paths) == 1:
         return str(group.paths[0])
-    return f"{group.folder}, {counted(len(group.paths), 'scan')}, {_form(group.head)}"
+    head, resolution = group.head, "no resolution"
+    if head.pitch.um is not None:
+        resolution = f"{' x '.join(f'{um:.3g}' for um in sorted(set(head.pitch.um)))} µm"
+    form = f"{head.file_format} {head.bits} bit {'colour' if head.channels > 1 else 'grey'}"
+    size = f"about {head.width_px} x {head.height_px} px"
+    return f"{group.folder}, {counted(len(group.paths), 'scan')}, {form}, {size}, {resolution}"
 
 
 def _candidate_lines(names: Sequence[str]) -> list[str]:
     """One line for each camera of the library, with what distinguishes it."""
     library = {name: read_camera(library_path(name)) for name in names}
     return [f"    {name}: {camera_words(camera)}" for name, camera in library.items()]
-
-
-def _form(head: ScanHead) -> str:
-    pitch = (
-        "no resolution"
-        if head.pitch.um is None
-        else f"{' x '.join(f'{um:.3g}' for um in sorted(set(head.pitch.um)))} µm"
-    )
-    colours = "colour" if head.channels > 1 else "grey"
-    return f"{head.file_format} {head.bits} bit {colours}, about {head.width_px} x {head.height_px} px, {pitch}"

@@ -33,7 +33,6 @@ from pipeline.results.measured_record import (
     MeasuredScan,
     finite_or_none,
     mark_row,
-    read_mark_row,
     read_scan,
     scan_detail,
     scan_location,
@@ -121,7 +120,7 @@ class Store(Database):
         rows = self.mark_rows(result) if with_marks else []
         try:
             detail = json.loads(self.detail(result))
-            return read_scan(image, detail, list(map(read_mark_row, rows)), scan_location(detail["scan"], folder))
+            return read_scan(image, detail, rows, scan_location(detail["scan"], folder))
         except (ValueError, TypeError, KeyError):  # damaged before its rows had digests
             raise self._damaged(result) from None
 
@@ -337,7 +336,11 @@ class Merged(NamedTuple):
 def check_mergeable(path: Path, others: Sequence[Path]) -> None:
     """Raise InputError for a file that is no store, or the store at `path` itself, before anything is written."""
     for other in others:
-        if not other.is_file() or not _begins_with(other, _SQLITE):
+        head = b""
+        if other.is_file():
+            with other.open("rb") as file:
+                head = file.read(len(_SQLITE))
+        if head != _SQLITE:
             what = "is no" if other.exists() else "there is no such"
             raise InputError(f"{other}: {what} results database. Name the out/measurement.K-of-N.db of each part.")
         if other.resolve() == path.resolve():
@@ -361,11 +364,6 @@ def merge(store: Store, others: Sequence[Path]) -> list[Merged]:
         finally:
             store.connection.execute("detach other")
     return merged
-
-
-def _begins_with(path: Path, start: bytes) -> bool:
-    with path.open("rb") as file:
-        return file.read(len(start)) == start
 
 
 def _insert(store: Store) -> int:

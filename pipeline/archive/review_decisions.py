@@ -95,15 +95,11 @@ def apply_decisions(
         before, old_key, counted = now, key, [*counted, one]
         now = _apply_to_task(task, standing(counted).values())
         key = key_of(now)
-        current_keys = current_keys | {key} if _names_alike(before, now, pose_of(old_key)) else {key}
+        was, will = before.options.fiducials.pose, now.options.fiducials.pose  # on which the names of marks depend
+        keeps_names = was == will or (was == "auto" and will == pose_of(old_key))
+        current_keys = current_keys | {key} if keeps_names else {key}
         ever |= current_keys
     return now, standing(counted)
-
-
-def _names_alike(before: ScanTask, now: ScanTask, pose: str | None) -> bool:
-    """Whether marks keep their names, which depend on the pose."""
-    was, will = before.options.fiducials.pose, now.options.fiducials.pose
-    return was == will or (will == pose and was == "auto")
 
 
 def before_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:
@@ -214,20 +210,14 @@ def _known_images(
     for image, *mark, is_measured in rows:
         marks[image][mark[0], mark[1]] = bool(is_measured)
     for image, own in decisions.items():
-        yield from _idle_lines(own, counting[image], marks[image])
-
-
-def _idle_lines(
-    decisions: Sequence[Decision], counting: Mapping[About, Decision], marks: Marks
-) -> Iterator[tuple[int, str]]:
-    stacks = dict[About, list[Decision]]()
-    for one in decisions:
-        if one.decision is Choice.UNDO and not stacks.get(one.subject):
-            yield one.line, f"there is nothing to undo about {_named(one)}."
-        push_decision(stacks, one)
-    for about, stack in stacks.items():
-        if stack and (why := _why(stack[-1], counting.get(about), marks)):
-            yield stack[-1].line, why
+        stacks = dict[About, list[Decision]]()
+        for one in own:
+            if one.decision is Choice.UNDO and not stacks.get(one.subject):
+                yield one.line, f"there is nothing to undo about {_named(one)}."
+            push_decision(stacks, one)
+        for about, stack in stacks.items():
+            if stack and (why := _why(stack[-1], counting[image].get(about), marks[image])):
+                yield stack[-1].line, why
 
 
 def _why(one: Decision, counted: Decision | None, marks: Marks) -> str:

@@ -255,7 +255,12 @@ def catalogue(given: Sequence[Path], count: Count, max_pixels: int | None = None
             own, number = number, number + 1
             alike.append((own, head))
         members[path.parent if by_folder else Path(), own].append((path, head))
-    copies = dict(_copies([path for path in files if path not in unread])) if by_folder else {}
+    copies = dict[Path, Path]()
+    if by_folder:
+        # The original has the shortest name, since copies are called `Copy of 0001` or `0001 (1)`.
+        by_name = sorted((path for path in files if path not in unread), key=lambda path: len(path.name))
+        for original, *others in alike_groups(by_name, lambda path: path.stat().st_size, parts_hash, content_hash):
+            copies |= dict.fromkeys(others, original)
     groups = (
         ScanGroup(some[0][0].parent, some[0][1], tuple(path for path, _ in some if path not in copies))
         for _, some in sorted(members.items(), key=lambda item: item[0])
@@ -383,11 +388,3 @@ def _files_below(folder: Path) -> Iterator[Path]:
         with suppress(OSError), os.scandir(folder / place) as entries:
             names = [entry.name for entry in entries if not entry.is_dir() and not entry.name.startswith(".")]
             yield from (folder / place / name for name in names)
-
-
-def _copies(files: Sequence[Path]) -> Iterator[tuple[Path, Path]]:
-    """Yield (copy, original) for files with identical bytes; size and a hash of parts are compared first."""
-    # The original has the shortest name, since copies are called `Copy of 0001` or `0001 (1)`.
-    by_name = sorted(files, key=lambda path: len(path.name))
-    for original, *others in alike_groups(by_name, lambda path: path.stat().st_size, parts_hash, content_hash):
-        yield from ((path, original) for path in others)

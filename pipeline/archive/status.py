@@ -3,7 +3,7 @@
 import csv
 import io
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from pipeline.archive.checked_results import Judging, latest
+from pipeline.archive.checked_results import latest
 from pipeline.archive.results_database import Store
 from pipeline.archive.review_decisions import (
     decisions_hash,
@@ -30,6 +30,7 @@ from pipeline.provenance import FileState, FileStates, content_hash
 from pipeline.results.measured_record import FailureCode
 
 NAMED = 20  # scans that a summary names
+_DAMAGED = "stored result damaged (digest differs): `reseau measure --retry` measures it again"
 _LOOK = (Verdict.FAILED, Verdict.POOR, Verdict.LOOK)  # from the worst
 
 
@@ -81,11 +82,16 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
     path: of the store; None for the project's.
     """
     path = path or project.measurement_path
-    rows, idle = {}, tuple[str, ...]()
+    rows, idle = dict[str, list[Any]](), tuple[str, ...]()
     if path.exists():
         with Store(path) as store:
             judging = latest(store)
-            rows = {row[0]: row for row in _status_rows(store, judging)}
+            if judging is not None:
+                judging.check()
+            for *row, is_whole in store.connection.execute(_QUERY, (-1 if judging is None else judging.row,)):
+                if not is_whole:
+                    row[6:] = [str(Verdict.FAILED), _DAMAGED, str(FailureCode.DAMAGED), None, "", row[11], None]
+                rows[row[0]] = row
             idle = inapplicable(judging)
     files, scans = FileStates(project.path.resolve().parent), []
     request_hash, decisions = request_hasher(project), group_decisions(project.decisions)
@@ -96,7 +102,10 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
             scans.append(ScanStatus(name, state.uri, camera, Verdict.WAITING))
             continue
         *earlier, content, is_current, verdict, why, failure, seconds, finished, request, taken_in = found
-        is_same = is_current and _is_same(state, FileState(*earlier), content, file)
+        before = FileState(*earlier)
+        is_same = is_current and (
+            state == before or (content and state.is_touched(before) and content_hash(Path(file)) == content)
+        )
         is_now = is_same and request in (None, request_hash(name))
         now = Verdict(verdict) if is_now else Verdict.OLD
         if is_now and taken_in is not None and taken_in != decisions_hash(decisions.get(name, ())):
@@ -104,22 +113,6 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
         scans.append(ScanStatus(name, state.uri, camera, now, why or "", failure or "", seconds, finished))
     unknown = shortened([f"line {number}: {why}" for number, why in sorted(unknown_images(project))])
     return ArchiveStatus(tuple(sorted(scans)), tuple(dict.fromkeys((*unknown, *idle))))
-
-
-def _is_same(state: FileState, earlier: FileState, content: str, file: str | Path) -> bool:
-    """Whether a file is as it was measured: of that time, or of the content that was hashed."""
-    return state == earlier or bool(content and state.is_touched(earlier) and content_hash(Path(file)) == content)
-
-
-def _status_rows(store: Store, judging: Judging | None) -> Iterator[Sequence[Any]]:
-    """Rows of the query; a damaged row is reported as a failure."""
-    if judging is not None:
-        judging.check()
-    why = "stored result damaged (digest differs): `reseau measure --retry` measures it again"
-    for *row, is_whole in store.connection.execute(_QUERY, (-1 if judging is None else judging.row,)):
-        yield (
-            row if is_whole else (*row[:6], str(Verdict.FAILED), why, str(FailureCode.DAMAGED), None, "", row[11], None)
-        )
 
 
 _QUERY = f"""

@@ -11,7 +11,6 @@ from typing import Self
 import numpy as np
 
 from measure.errors import MeasurementError
-from measure.results import MarkMeasurement
 from measure.scans.opening import open_scan
 from measure.scans.remote import scan_path
 from measure.scans.scan import Scan
@@ -95,20 +94,20 @@ class Thumbnails:
     def __init__(
         self,
         scans: Collection[MeasuredScan],
-        max_pixels: int | None = None,
-        measurement: Path | None = None,
-        fingerprints: Mapping[str, str] | None = None,
+        max_pixels: int | None,
+        measurement: Path,
+        fingerprints: Mapping[str, str],
     ) -> None:
         """Prepare the windows of the scans' marks.
 
-        measurement: results database that has stored thumbnails; fingerprints: {image: fingerprint of its result}.
+        measurement: results database, beside which thumbnails may be stored; fingerprints: {image: that of its result}.
         """
         self._max_pixels = max_pixels
         self._scans = {scan.frame.image: scan for scan in scans}
         self._marks = {(s.frame.image, m.point, m.kind == "fiducial"): m for s in scans for m in s.frame.marks}
-        self._fingerprints = fingerprints or {}
+        self._fingerprints = fingerprints
         self._kept: ThumbnailStore | None = None
-        if measurement is not None and thumbnails_path(measurement).exists():
+        if thumbnails_path(measurement).exists():
             with suppress(InputError):  # a damaged file: thumbnails are cut from the scans instead
                 self._kept = ThumbnailStore(measurement)
         self._open: tuple[Path, Scan] | None = None
@@ -127,20 +126,15 @@ class Thumbnails:
         mark = self._marks.get((image, point, kind == "fiducial"))
         if mark is None or mark.center_px is None:
             return None
-        if (kept := self._get_stored(image, mark)) is not None:
-            return kept
+        if kept := self._kept and self._kept.get(self._fingerprints.get(image, ""), mark.point, mark.kind):
+            width_px = np.array(kept.pixels.shape[::-1]) * kept.step_px
+            middle_px = kept.origin_px + (width_px - kept.step_px) / 2.0
+            if (np.abs(mark.center_px - middle_px) < _OFF_MIDDLE * width_px).all():
+                return kept
         try:
             return cut(self._scan(scan_path(self._scans[image].scan)), mark)
         except MeasurementError:
             return None
-
-    def _get_stored(self, image: str, mark: MarkMeasurement) -> Thumbnail | None:
-        thumbnail = self._kept and self._kept.get(self._fingerprints.get(image, ""), mark.point, mark.kind)
-        if not thumbnail or mark.center_px is None:
-            return None
-        width_px = np.array(thumbnail.pixels.shape[::-1]) * thumbnail.step_px
-        middle_px = thumbnail.origin_px + (width_px - thumbnail.step_px) / 2.0
-        return thumbnail if (np.abs(mark.center_px - middle_px) < _OFF_MIDDLE * width_px).all() else None
 
     def _scan(self, path: Path) -> Scan:
         if self._open is None or self._open[0] != path:

@@ -5,7 +5,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import chain
 from statistics import fmean
 
@@ -14,6 +14,7 @@ import numpy as np
 from measure.errors import MeasurementError
 from measure.scans.remote import scan_path
 from pipeline.archive import review_decisions
+from pipeline.archive.checked_results import CheckedResult
 from pipeline.archive.results_database import Kept, Store
 from pipeline.archive.thumbnails import ThumbnailStore
 from pipeline.files.decisions_file import About, Decision
@@ -38,11 +39,10 @@ class Work:
         self,
         project: Project,
         store: Store,
-        executor: Executor | None,
-        options: WorkOptions | None = None,
-        thumbnails: ThumbnailStore | None = None,
+        executor: Executor,
+        options: WorkOptions,
+        thumbnails: ThumbnailStore,
     ) -> None:
-        options = options or WorkOptions()
         self._project, self._store, self._executor, self._thumbnails = project, store, executor, thumbnails
         self._at_a_time = options.workers or os.cpu_count() or 1
         self._only_kept = options.only_kept
@@ -83,8 +83,7 @@ class Work:
     def picture(self, scan: MeasuredScan) -> Array | None:
         """Reduced grey values (rows, columns) of a whole scan, stored or read again; None where it cannot be read."""
         key = self._store.first("select fingerprint from result where id = ?", self.results[scan.frame.image])
-        stored = self._thumbnails.get(key) if self._thumbnails else None
-        if stored is not None:
+        if (stored := self._thumbnails.get(key)) is not None:
             return np.asarray(stored.pixels)
         try:
             with self._project.open_scan(scan.frame.image) as opened:
@@ -107,9 +106,11 @@ class Work:
         """Hash of all decisions about an image, whether they apply or not."""
         return review_decisions.decisions_hash(self.decisions.get(name, ()))
 
-    def apply_decisions(self, scan: MeasuredScan) -> MeasuredScan:
-        """Checked scan with all decisions applied."""
-        return review_decisions.after_checks(scan, self.counting[scan.frame.image])
+    def checked_result(self, scan: MeasuredScan) -> CheckedResult:
+        """Result of a scan after the cross-scan checks, with all decisions applied."""
+        name = scan.frame.image
+        decided = review_decisions.after_checks(scan, self.counting[name])
+        return CheckedResult(self.results[name], decided, self.decisions_hash(name))
 
     def keys(self) -> dict[str, str]:
         """{image: fingerprint of its last requested result}."""
@@ -132,7 +133,10 @@ class Work:
 
     def _complete(self, tasks: Sequence[ScanTask], scans: int, reporter: Reporter) -> None:
         """Measure the missing scans. scans: number of all scans; those measured earlier count as done."""
-        kinds = {task.name: self._kind(task) for task in tasks}
+        kinds = {  # camera and file format, on which the time for a scan depends
+            task.name: (self._project.image_camera(task.name).path.stem, task.shown_scan.rpartition(".")[2].lower())
+            for task in tasks
+        }
         left, failed = Counter(kinds.values()), defaultdict[str, list[str]](list)
         seconds = defaultdict[tuple[str, str], list[float]](list)
         with reporter.stage("scans measured:") as count:
@@ -155,33 +159,25 @@ class Work:
             if others:
                 reporter.say(f"failed as {first} did: {counted(len(others), 'scan')} more, {listed(others)}")
 
-    def _kind(self, task: ScanTask) -> tuple[str, str]:
-        """Camera and file format, on which the time for a scan depends."""
-        return self._project.image_camera(task.name).path.stem, task.shown_scan.rpartition(".")[2].lower()
-
-    def _reviewed_task(self, task: ScanTask) -> ScanTask:
-        """Task with the decisions about its scan applied."""
-        decisions = self.decisions.get(task.name)
-        if decisions is None:
-            return task
-        identity = self._identity(task) or Identity(self.state(task), parts_hash(scan_path(task.scan)))
-        task, self.counting[task.name] = review_decisions.apply_decisions(
-            task,
-            decisions,
-            lambda one: result_key(identity, _hash_of(_options_json(one))),
-            lambda key: None if (row := self._rows.get(key)) is None else self._store.pose_name(row),
-        )
-        return task
-
     def _stored_rows(self, tasks: Iterable[ScanTask]) -> tuple[dict[str, int], list[ScanTask]]:
-        """Rows of the stored results for the tasks' present files and options, by image; tasks that have none."""
-        known, missing = dict[str, int](), list[ScanTask]()
-        for task in map(self._reviewed_task, tasks):
-            identity = self._identity(task)
-            key = "" if identity is None else result_key(identity, _hash_of(_options_json(task)))
+        """Rows of the stored results for the tasks' present files and options, by image, and tasks that have none, with
+        the decisions about their scans applied."""
+
+        def pose_of(key: str) -> str | None:
             row = self._rows.get(key)
+            return None if row is None else self._store.pose_name(row)
+
+        known, missing = dict[str, int](), list[ScanTask]()
+        for task in tasks:
+            identity, reviewed = self._identity(task), task
+            if decisions := self.decisions.get(task.name):
+                reviewed_file = identity or Identity(self.state(task), parts_hash(scan_path(task.scan)))
+                reviewed, self.counting[task.name] = review_decisions.apply_decisions(
+                    task, decisions, partial(_key, reviewed_file), pose_of
+                )
+            row = None if identity is None else self._rows.get(_key(identity, reviewed))
             if row is None:
-                missing.append(task)
+                missing.append(reviewed)
             else:
                 known[task.name] = row
         self.results |= known
@@ -199,7 +195,7 @@ class Work:
             if not file.parts_hash:  # the process was lost
                 identity = self._identity(task) or identity
             kept = Kept(identity, _options_json(task), file.scan, file.bytes_read, camera.path.name)
-            if self._thumbnails is not None and file.thumbnails:
+            if file.thumbnails:
                 self._thumbnails.keep(kept.fingerprint, file.thumbnails)
             row = self._store.keep(kept, *((task.name, self._asked(task.name)) if as_scans else ()))
             self._identities[identity.state.uri], self._rows[kept.fingerprint] = identity, row
@@ -212,3 +208,8 @@ def _options_json(task: ScanTask) -> str:
     """JSON of all that a result depends on in addition to the scan, including whether writing can be read."""
     json = task.options.json
     return f'{json[:-1]},"reads":true}}' if reads_writing(task.options) else json
+
+
+def _key(identity: Identity, task: ScanTask) -> str:
+    """Fingerprint of the result of a task."""
+    return result_key(identity, _hash_of(_options_json(task)))

@@ -25,7 +25,6 @@ from pipeline.files.project_file import Project
 from pipeline.results.adjustment_file import Covariance, read_own_covariance, write_with_covariance
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, FiducialRecord, Quantity
 from pipeline.results.comparator_file import read_comparator
-from pipeline.results.record_json import json_text
 from pipeline.text.files import write_atomically
 from pipeline.text.wording import counted, listed
 from pipeline.types import Array
@@ -123,7 +122,7 @@ def _save(calibrations: Sequence[_Calibration], path: Path) -> SavedCamera:
     labels = {one.label_in_camera: value for one, value in spread.items()}
     source = Source(text=text, frames=frames, scanners=scanners, archives=len(calibrations), spread_mm=labels)
     earlier = path.with_name(f"{path.stem}-calibration.json")
-    write_with_covariance(earlier, json_text(record), Covariance(first.parameters, values, covariance).arrays)
+    write_with_covariance(earlier, record, Covariance(first.parameters, values, covariance).arrays)
     camera = _adjusted_camera(first, record.cameras[first.camera.name], earlier, path, source)
     body = camera_text(camera, picture_writer(path.parent, f"{path.stem}-"))
     write_atomically(path, f"{_HEAD}: values, and in {earlier.name} their covariance.\n{body}")

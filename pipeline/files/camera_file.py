@@ -33,41 +33,6 @@ _FEWEST_ABOUT_ORIGIN = 3  # fiducials needed to determine their middle
 _OFF_MIDDLE = 0.25  # fraction of the fiducials' extent: an origin farther from their middle is not the frame's centre
 
 
-def check_units(
-    table: Table,
-    frame_mm: tuple[float, float],
-    distance_mm: float | None,
-    fiducials: Sequence[tuple[Table, shapes.Point, shapes.Mark | shapes.LearnedMark | None]],
-) -> None:
-    """Raise InputError for lengths that are impossible for the size of the frame.
-
-    distance_mm: principal distance, None where it is not given; fiducials: table, coordinates and mark of each.
-    """
-    frame = f"the frame of {frame_mm[0]:g} x {frame_mm[1]:g} mm"
-    half_diagonal = math.hypot(*frame_mm) / 2
-    if distance_mm is not None and not 1 / FIELD_RATIO < distance_mm / half_diagonal < LONGEST_RATIO:
-        raise table.error("principal_distance_mm", f"{distance_mm:g} mm is impossible for {frame}. Give both in mm.")
-    places = [xy for _, xy, _ in fiducials]
-    apart_mm = float(np.ptp(places, axis=0).max()) if len(places) > 1 else math.inf
-    for entry, xy, mark in fiducials:
-        size_mm = _size_mm(mark)
-        if max(map(abs, xy)) > 2 * max(frame_mm):
-            raise entry.error("xy_mm", f"lies far outside of {frame}. Give mm from its middle.")
-        if apart_mm < max(frame_mm) / FIELD_RATIO:
-            raise entry.error("xy_mm", f"all fiducials lie within {apart_mm:.3g} mm, in {frame}. Give mm.")
-        if size_mm > min(frame_mm) / 2:
-            raise entry.error("mark", f"is drawn {size_mm:.4g} mm large, in {frame}. Give its sizes in mm.")
-
-
-def _size_mm(mark: shapes.Mark | shapes.LearnedMark | None) -> float:
-    """Larger of width and height of a mark; 0 without a drawing, and for frame corners."""
-    if mark is None or isinstance(mark, shapes.FrameCorner):
-        return 0.0
-    if isinstance(mark, shapes.LearnedMark):
-        return mark.size_mm
-    return float(np.ptp(extent_px(mark, np.eye(2, 3)), axis=0).max())
-
-
 @dataclasses.dataclass(frozen=True)
 class GivenFiducial:
     """Fiducial of a camera file.
@@ -216,9 +181,7 @@ def parse_camera(table: Table) -> CameraFile:
     point, point_sigma = _default_principal_point(fiducials)
     if given.principal_point_mm is not None:
         point, point_sigma = given.principal_point_mm, default_sigma
-    if given.frame_mm is not None:
-        marks = [(entry, one.xy_mm, one.mark) for entry, one in zip(entries, fiducials, strict=True)]
-        check_units(table, given.frame_mm, given.principal_distance_mm, marks)
+    _check_units(table, given, entries, fiducials)
     learned = [one.id for one in fiducials if isinstance(one.mark, shapes.LearnedMark)]
     distance_sigma = given.sigma.principal_distance_mm
     distances = table.tables("fiducial_distance")
@@ -240,6 +203,30 @@ def parse_camera(table: Table) -> CameraFile:
         distances=fiducial_distances(distances, given.fiducial_distance, [one.id for one in fiducials]),
     )
     return replace(camera, calibration=read_calibration(table.table("sigma"), given.sigma, camera.camera()))
+
+
+def _check_units(
+    table: Table, given: camera_tables.CameraTable, entries: Sequence[Table], fiducials: Sequence[GivenFiducial]
+) -> None:
+    """Raise InputError for lengths that are impossible for the size of the frame. entries: tables of the fiducials."""
+    if given.frame_mm is None:
+        return
+    frame = f"the frame of {given.frame_mm[0]:g} x {given.frame_mm[1]:g} mm"
+    distance_mm, half_diagonal = given.principal_distance_mm, math.hypot(*given.frame_mm) / 2
+    if distance_mm is not None and not 1 / FIELD_RATIO < distance_mm / half_diagonal < LONGEST_RATIO:
+        raise table.error("principal_distance_mm", f"{distance_mm:g} mm is impossible for {frame}. Give both in mm.")
+    places = [one.xy_mm for one in fiducials]
+    apart_mm = float(np.ptp(places, axis=0).max()) if len(places) > 1 else math.inf
+    for entry, one in zip(entries, fiducials, strict=True):
+        size_mm = one.mark.size_mm if isinstance(one.mark, shapes.LearnedMark) else 0.0
+        if isinstance(one.mark, shapes.Mark) and not isinstance(one.mark, shapes.FrameCorner):
+            size_mm = float(np.ptp(extent_px(one.mark, np.eye(2, 3)), axis=0).max())
+        if max(map(abs, one.xy_mm)) > 2 * max(given.frame_mm):
+            raise entry.error("xy_mm", f"lies far outside of {frame}. Give mm from its middle.")
+        if apart_mm < max(given.frame_mm) / FIELD_RATIO:
+            raise entry.error("xy_mm", f"all fiducials lie within {apart_mm:.3g} mm, in {frame}. Give mm.")
+        if size_mm > min(given.frame_mm) / 2:
+            raise entry.error("mark", f"is drawn {size_mm:.4g} mm large, in {frame}. Give its sizes in mm.")
 
 
 def _fiducials(
@@ -365,7 +352,8 @@ def camera_text(camera: CameraFile, save: SavePicture) -> str:
             "principal_distance_mm": camera.principal_distance_sigma_mm,
             "principal_point_mm": camera.principal_point_sigma_mm,
             "calibration": calibration and os.path.relpath(calibration.path, camera.path.parent),
-            "calibration_fiducials": calibration and calibration.tells_fiducials,
+            "calibration_fiducials": calibration
+            and any(each.kind == "fiducial" for each in (*calibration.parameters, *calibration.held)),
         },
         "source": {key: value for key, value in source.items() if value} or None,
         "distortion": {

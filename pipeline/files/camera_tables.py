@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping
 from dataclasses import field
+from functools import partial
 from typing import Annotated, Any, cast, get_args
 
 from pydantic import Field
@@ -13,7 +14,6 @@ from measure.marks import shapes
 from pipeline.files.mark_table import LearnedFrom
 from pipeline.text import table_models as models
 from pipeline.text.table_models import text
-from pipeline.text.wording import did_you_mean
 
 DEFAULT_SIGMA_MM = 1.0  # Torlegård's a-priori standard deviation for a prior that only fixes the datum
 READS: Mapping[str, str] = {"rightward": "0", "upward": "90", "leftward": "180", "downward": "270"}  # poses
@@ -63,14 +63,6 @@ def _fiducial_id(value: Any) -> str:
     return str(value)
 
 
-def _family(value: Any) -> str:
-    try:
-        family(text(value))
-    except ValueError as error:
-        raise ValueError(f"{error}.{did_you_mean(value, FAMILY_NAMES)}") from None
-    return str(value)
-
-
 @models.table_model
 class Source:
     """[source] of a camera file: where its numbers come from, and the number of calibration reports or frames behind
@@ -98,11 +90,14 @@ class SigmaTable:
     calibration_fiducials: Annotated[bool, "Whether the earlier calibration says where the fiducials are."] = True
 
 
+_FAMILY = models.Key("name of a family", partial(models.known_name, find=family, names=FAMILY_NAMES))
+
+
 @models.table_model
 class DistortionTable:
     """[distortion] of a camera file."""
 
-    family: Annotated[str, models.Key("name of a family", _family), "Distortion model."] = "none"
+    family: Annotated[str, _FAMILY, "Distortion model."] = "none"
     decentering: Annotated[Decentering, "Decentering terms of torlegard."] = "reduced"
     r0_mm: Annotated[models.NotNegative, "Radius of no distortion."] = 0.0
     r0_dm: Annotated[models.Positive | None, "The same of juhl."] = None

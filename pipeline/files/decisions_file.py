@@ -150,19 +150,6 @@ def _check_decision(decision: Decision) -> Decision:
 _DECISION = TypeAdapter(Annotated[Decision, AfterValidator(_check_decision)])
 
 
-def decision_line(decision: Decision) -> str:
-    """Line of the file. Raises InputError for a decision that could not be read again."""
-    values = {key: getattr(decision, key) for key in _KEYS}
-    content = {key: value for key, value in values.items() if value not in (None, "", {})}
-    try:
-        line = json.dumps(content, ensure_ascii=False, allow_nan=False)
-        parse_decision(line.encode())
-    except (LineError, ValueError) as error:
-        about = f"{decision.image}{f', {decision.point}' if decision.point else ''}"
-        raise InputError(f"the decision about {about}{error}. Nothing was written.") from None
-    return f"{line}\n"
-
-
 class LineError(Exception):
     """Error in a line; its text follows the line's number."""
 
@@ -259,9 +246,18 @@ def append_decisions(path: Path, decisions: Iterable[Decision]) -> None:
     WriteError
         The lines cannot be written; the file is unchanged.
     """
-    text = "".join(decision_line(decision) for decision in decisions)
+    lines = []
+    for decision in decisions:
+        values = {key: getattr(decision, key) for key in _KEYS}
+        content = {key: value for key, value in values.items() if value not in (None, "", {})}
+        try:
+            lines.append(json.dumps(content, ensure_ascii=False, allow_nan=False) + "\n")
+            parse_decision(lines[-1].encode())
+        except (LineError, ValueError) as error:
+            about = f"{decision.image}{f', {decision.point}' if decision.point else ''}"
+            raise InputError(f"the decision about {about}{error}. Nothing was written.") from None
     with _locked(path.parent):
-        write_atomically(path.resolve(), _whole_lines(path) + text.encode())
+        write_atomically(path.resolve(), _whole_lines(path) + "".join(lines).encode())
 
 
 @contextmanager

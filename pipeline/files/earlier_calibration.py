@@ -42,10 +42,6 @@ class EarlierCalibration:
     covariance: Array
     held: Mapping[Parameter, float]
 
-    @property
-    def tells_fiducials(self) -> bool:
-        return any(each.kind == "fiducial" for each in (*self.parameters, *self.held))
-
     def applied(self, camera: Camera) -> tuple[Camera, Calibration]:
         """The camera, with priors removed where the calibration replaces them, and the calibration for the network."""
         here = tuple(each._replace(owner=camera.name) for each in self.parameters)

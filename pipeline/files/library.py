@@ -3,7 +3,7 @@ short file from the kinds and distances of a camera's marks."""
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,7 +65,24 @@ def camera_words(camera: CameraFile) -> str:
 
 
 def library_json() -> list[Json]:
-    return [_entry(name, camera) for name, camera in read_library().items()]
+    return [
+        {
+            "name": name,
+            "title": camera.name,
+            "frame_mm": list(camera.frame_mm or ()),
+            "writing": [written_place_text(place) for place in camera.writing],
+            "principal_distance_mm": {
+                "value": camera.principal_distance_mm,
+                "sigma": camera.principal_distance_sigma_mm,
+            },
+            "fiducials": len(camera.fiducials),
+            "drawn": [mark.id for mark in camera.layout_marks],
+            "learned": [one.id for one in camera.learned],
+            "reports": camera.source.reports if camera.source else 0,
+            "source": camera.source.text if camera.source else "",
+        }
+        for name, camera in read_library().items()
+    ]
 
 
 def print_library(console: Console) -> None:
@@ -75,13 +92,14 @@ def print_library(console: Console) -> None:
         table.add_column(heading, no_wrap=True, min_width=widest if heading == "camera" else None)
     sources: dict[str, str] = {}
     for entry in library_json():
-        c = entry["principal_distance_mm"]
+        c, drawn = entry["principal_distance_mm"], len(entry["drawn"])
+        shape = "known" if drawn == entry["fiducials"] else f"of {drawn}" if drawn else "not known"
         table.add_row(
             entry["name"],
             " x ".join(f"{side:g}" for side in dict.fromkeys(entry["frame_mm"])),
             f"{c['value']:.2f} ± {c['sigma']:.2f}",
             str(entry["fiducials"]),
-            _shape(entry),
+            "learned" if entry["learned"] else shape,
             str(entry["reports"]),
         )
         sources[entry["name"].rsplit("-", 1)[0]] = entry["source"]
@@ -93,28 +111,6 @@ def print_library(console: Console) -> None:
         "Marks whose shape is not known are learned from the scans, or passed over.",
         highlight=False,
     )
-
-
-def _shape(entry: Json) -> str:
-    drawn, learned = len(entry["drawn"]), len(entry["learned"])
-    if learned:
-        return "learned"
-    return "known" if drawn == entry["fiducials"] else f"of {drawn}" if drawn else "not known"
-
-
-def _entry(name: str, camera: CameraFile) -> Json:
-    return {
-        "name": name,
-        "title": camera.name,
-        "frame_mm": list(camera.frame_mm or ()),
-        "writing": [written_place_text(place) for place in camera.writing],
-        "principal_distance_mm": {"value": camera.principal_distance_mm, "sigma": camera.principal_distance_sigma_mm},
-        "fiducials": len(camera.fiducials),
-        "drawn": [mark.id for mark in camera.layout_marks],
-        "learned": [one.id for one in camera.learned],
-        "reports": camera.source.reports if camera.source else 0,
-        "source": camera.source.text if camera.source else "",
-    }
 
 
 _PLACES: Mapping[str, Mapping[str, Point]] = {  # in units of the distances, numbered as in calibration reports
@@ -292,22 +288,13 @@ def camera_template(sizes: CameraSizes) -> str:
             xy_mm = f"[{right * size[0]:g}, {up * size[1]:g}]"
             lines.append(f'    {{id = "{id}", xy_mm = {xy_mm}, sigma_mm = 1.0, mark = "{_NAMES[place]}"}},')
     lines.append("]")
-    drawings = {_NAMES[place]: _drawing(kind, place, sizes.scale) for place, (kind, _) in sizes.kinds.items()}
-    return "\n".join([*lines, *_commented(drawings)]) + "\n"
-
-
-def _drawing(kind: str, place: str, scale: float) -> MarkJson:
-    """Content of the table of a kind of mark; crosses in corners are diagonal."""
-    drawing = scaled_mark(MARK_KINDS[kind].drawing, scale)
-    polarity = {} if kind == "learned" else {"polarity": "auto"}
-    turned = {"angle_deg": 45.0} if "angle_deg" in drawing and place == "square" else {}
-    return {"kind": drawing["kind"], **polarity, **drawing, **turned}
-
-
-def _commented(drawings: Mapping[str, MarkJson]) -> Iterator[str]:
-    """Yield the lines of the tables [mark.NAME], each key of a mark with its meaning."""
-    for name, drawing in drawings.items():
+    for place, (kind, _) in sizes.kinds.items():
+        drawing = scaled_mark(MARK_KINDS[kind].drawing, sizes.scale)
+        polarity = {} if kind == "learned" else {"polarity": "auto"}
+        turned = {"angle_deg": 45.0} if "angle_deg" in drawing and place == "square" else {}  # diagonal in corners
+        drawing = {"kind": drawing["kind"], **polarity, **drawing, **turned}
         meanings = {row.name: row.meaning for row in key_rows(MARK_TABLES[drawing["kind"]]) if row.name != "kind"}
-        for line in table_lines({"mark": {name: drawing}}):
+        for line in table_lines({"mark": {_NAMES[place]: drawing}}):
             meaning = meanings.get(line.partition(" = ")[0])
-            yield _line(line, meaning) if meaning and len(line) < 40 else line
+            lines.append(_line(line, meaning) if meaning and len(line) < 40 else line)
+    return "\n".join(lines) + "\n"

@@ -89,32 +89,27 @@ class GivenDistance:
 
 def read_distances(path: Path) -> tuple[GivenDistance, ...]:
     """Read distances.csv, in the unit of the object coordinates. Raises InputError with line and column."""
-    distances = tuple(GivenDistance(_distance(row), row) for row in read_csv(path, COLUMNS))
+    distances = []
+    for row in read_csv(path, COLUMNS):
+        start, end = row.name("from"), row.name("to")
+        if start == end:
+            raise row.error("to", f"{end!r} stands at both ends. Give two points, or two images for their stations.")
+        value = row.number("distance")
+        if value is None or value <= 0.0:
+            raise row.error("distance", f"must be a positive length, not {row.text('distance')!r}.")
+        sigma = row.sigma("sigma")
+        if sigma is None:
+            raise row.error("sigma", "is blank: every distance needs its standard deviation.")
+        if sigma == 0.0:
+            raise row.error(
+                "sigma",
+                "is 0, but an exact distance is not offered. Give it a hundredth of the standard deviations of its "
+                "ends.",
+            )
+        distances.append(GivenDistance(Distance(start, end, value, sigma), row))
     if not distances:
         raise InputError(f"{path}: holds no distance, only a header.")
-    return distances
-
-
-def _distance(row: Row) -> Distance:
-    start, end = row.name("from"), row.name("to")
-    if start == end:
-        raise row.error("to", f"{end!r} stands at both ends. Give two points, or two images for their stations.")
-    value, sigma = _positive(row, "distance"), row.sigma("sigma")
-    if sigma is None:
-        raise row.error("sigma", "is blank: every distance needs its standard deviation.")
-    if sigma == 0.0:
-        raise row.error(
-            "sigma",
-            "is 0, but an exact distance is not offered. Give it a hundredth of the standard deviations of its ends.",
-        )
-    return Distance(start, end, value, sigma)
-
-
-def _positive(row: Row, column: str) -> float:
-    value = row.number(column)
-    if value is None or value <= 0.0:
-        raise row.error(column, f"must be a positive length, not {row.text(column)!r}.")
-    return value
+    return tuple(distances)
 
 
 ELEMENTS = ("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg")

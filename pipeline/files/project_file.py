@@ -20,7 +20,7 @@ from pipeline.files.decisions_file import Decision, cut_short_line, decisions_by
 from pipeline.files.library import PREFIX, camera_path
 from pipeline.files.mark_table import Clicks
 from pipeline.files.project_tables import UNITS_MM, AdjustSettings, ProjectTable
-from pipeline.files.scan_files import FoundScans, add_cuts, as_named, find_scans
+from pipeline.files.scan_files import add_cuts, as_named, find_scans
 from pipeline.files.target_table import TargetSettings, TieSettings, read_targets
 from pipeline.provenance import hash_content
 from pipeline.results.adjustment_file import covariance_path
@@ -279,15 +279,13 @@ def _read_tables(table: Table, needs_camera: bool = True) -> Project:
     lacks_camera = not (needs_camera or given.camera.startswith(PREFIX) or (folder / given.camera).exists())
     _check_named(table, objects, "" if lacks_camera else given.camera, named)
     images = object_files.read_images(named["images"], antenna) if "images" in named else None
-    found = FoundScans({}, frozenset())
-    if given.scans is not None:
-        found = find_scans(table, given.scans, given.exclude)
+    scans, left_out = find_scans(table, given.scans, given.exclude) if given.scans is not None else ({}, frozenset())
     project = Project(
         path=path,
         cameras={} if lacks_camera else _cameras(table, given.camera, images),
         missing_camera=given.camera if lacks_camera else "",
-        scans=add_cuts(found.files, images, named.get("images")),
-        left_out=found.left_out,
+        scans=add_cuts(scans, images, named.get("images")),
+        left_out=left_out,
         comparator=folder / given.comparator,
         pitch_um=given.pitch_um,
         output=folder / given.output,
@@ -338,33 +336,28 @@ def _taking_lens(table: Table, given: ProjectTable) -> "CalibratedLens | None":
 def reload_decisions(project: Project) -> Project:
     """Project with the present content of decisions.jsonl, including clicks on marks to be learned that the camera file
     lacks. Raises InputError with the line, or with the missing marks."""
-    data = decisions_bytes(project.decisions_path)
-    decisions, cut_short = parse_decisions(project.decisions_path, data), cut_short_line(data)
+    path = project.decisions_path
+    data = decisions_bytes(path)
+    decisions, cut_short = parse_decisions(path, data), cut_short_line(data)
     cameras = dict(project.cameras)
     for name, camera in project.cameras.items():
-        if camera.needs_clicks:
-            images = {image for image in project.scans if project.image_camera(image) is camera}
-            cameras[name] = replace(camera, clicks=_clicks(project, camera, learned_from(decisions, images)))
+        if not camera.needs_clicks:
+            continue
+        shown = learned_from(decisions, {one for one in project.scans if project.image_camera(one) is camera})
+        ids, clicks = [one.id for one in camera.learned], None
+        if shown is not None:
+            if missing := [id for id in ids if id not in shown.px]:
+                raise InputError(
+                    f"{path}: the decision to learn the marks of {camera.name} from {shown.image} says nothing of "
+                    f"{', '.join(missing)}. Show all of them in `reseau review`, or take the line out."
+                )
+            px = {id: shown.px[id] for id in ids}
+            clicks = Clicks(shown.image, px, shown.fingerprint, shown.who or "somebody")
+        cameras[name] = replace(camera, clicks=clicks)
+    decisions_hash = hash_content(data) if decisions else ""
     return replace(
-        project,
-        cameras=cameras,
-        decisions=decisions,
-        decisions_hash=hash_content(data) if decisions else "",
-        decisions_cut_short=cut_short,
+        project, cameras=cameras, decisions=decisions, decisions_hash=decisions_hash, decisions_cut_short=cut_short
     )
-
-
-def _clicks(project: Project, camera: CameraFile, shown: Decision | None) -> Clicks | None:
-    if shown is None:
-        return None
-    missing = [one.id for one in camera.learned if one.id not in shown.px]
-    if missing:
-        raise InputError(
-            f"{project.decisions_path}: the decision to learn the marks of {camera.name} from {shown.image} says "
-            f"nothing of {', '.join(missing)}. Show all of them in `reseau review`, or take the line out."
-        )
-    px = {one.id: shown.px[one.id] for one in camera.learned}
-    return Clicks(shown.image, px, shown.fingerprint, shown.who or "somebody")
 
 
 def _check_named(table: Table, objects: Table, camera: str, named: Mapping[str, Path]) -> None:

@@ -5,6 +5,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Annotated, Any, Literal, get_args
 
 from adjust.functional_model.scanner import is_term
@@ -30,6 +31,7 @@ from pipeline.text.table_models import (
     WrongKey,
     choice,
     key_rows,
+    known_name,
     number_or_pair,
     number_or_word,
     sigma,
@@ -37,7 +39,6 @@ from pipeline.text.table_models import (
     text,
     texts,
 )
-from pipeline.text.wording import did_you_mean
 
 Datum = Literal["control", "minimal", "free"]
 Method = Literal["combined", "elements"]
@@ -66,14 +67,6 @@ def scanner_setting(*words: str) -> Key:
         return terms
 
     return Key("word or list of terms", read)
-
-
-def _transformation(value: Any) -> str:
-    try:
-        film_kind(text(value))
-    except ValueError as error:
-        raise ValueError(f"{error}.{did_you_mean(value, FILM_NAMES)}") from None
-    return str(value)
 
 
 def _robust(value: Any) -> bool | str:
@@ -111,7 +104,7 @@ def _scanner_sigma(value: Any) -> float:
     return sigma_um
 
 
-Film = Annotated[Transformation, Key("text", _transformation)]
+Film = Annotated[Transformation, Key("text", partial(known_name, find=film_kind, names=FILM_NAMES))]
 ScannerSigma = Annotated[float, Key("standard deviation", _scanner_sigma)]
 _Names = Annotated[tuple[str, ...], Key("list of texts", _datum_names)]
 

@@ -5,7 +5,6 @@ import os
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -49,7 +48,11 @@ def folders_below(root: Path) -> Iterator[str]:
             continue
         entered.add(real)
         yield place
-        for name, is_link in _list_folders(real):
+        inner = list[tuple[str, bool]]()  # with links; a folder that may not be listed has none
+        with suppress(OSError), os.scandir(real) as entries:
+            folders = (one for one in entries if one.is_dir() and not one.name.startswith("."))
+            inner = sorted((one.name, one.is_symlink()) for one in folders)
+        for name, is_link in inner:
             below, target = os.path.join(place, name), os.path.join(real, name)
             if not is_link:
                 waiting.append((below, target))
@@ -80,13 +83,6 @@ def each_once(files: Mapping[str, bool], without: Iterable[str]) -> set[str]:
     return set(kept.values())
 
 
-def _list_folders(folder: str) -> list[tuple[str, bool]]:
-    """Names of the folders in a folder, and whether each is a link; empty for a folder that may not be listed."""
-    with suppress(OSError), os.scandir(folder) as entries:
-        return sorted((one.name, one.is_symlink()) for one in entries if one.is_dir() and not one.name.startswith("."))
-    return []
-
-
 # Scans that a project names: files, addresses and patterns at any depth; names of their images.
 
 
@@ -106,16 +102,11 @@ class ScanFiles(Mapping[str, Path]):
         return len(self.named)
 
 
-@dataclass(frozen=True, eq=False)
-class FoundScans:
-    """Scans found. files: by image name, in their order; left_out: names of the images that `exclude` leaves out."""
-
-    files: Mapping[str, Path]
-    left_out: frozenset[str]
-
-
-def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) -> FoundScans:
-    """Find the scan files that patterns match, without excluded ones.
+def find_scans(
+    table: Table, patterns: Sequence[str], exclude: Sequence[str]
+) -> tuple[Mapping[str, Path], frozenset[str]]:
+    """Find the scan files that patterns match: by image name, in their order; and the names of the images that
+    `exclude` leaves out.
 
     Raises InputError for a pattern that matches nothing, and for files whose images would share a name.
     """
@@ -152,7 +143,7 @@ def find_scans(table: Table, patterns: Sequence[str], exclude: Sequence[str]) ->
         if name in scans:
             raise table.error("scans", f"{scans[name]} and {file} have the same name {name!r}. Rename one of them.")
         scans[name] = file
-    return FoundScans(ScanFiles(scans), frozenset(names_below(files, left_out.values())))
+    return ScanFiles(scans), frozenset(names_below(files, left_out.values()))
 
 
 def add_cuts(scans: Mapping[str, Path], images: GivenImages | None, path: Path | None) -> Mapping[str, Path]:

@@ -76,27 +76,20 @@ def joined_frames(adjustment: Adjustment) -> dict[str, JoinedFrameRecord]:
     """
     if not adjustment.converged:
         return {}
-    parts = defaultdict[str, list[Image]](list)
-    for image in adjustment.network.images:
+    network, parts = adjustment.network, defaultdict[str, dict[str, PartRecord]](dict)
+    marks, camera_mm = defaultdict[str, list[PartMarkRecord]](list), dict[int, Array]()
+    for image in network.images:
         if image.part_of:
-            parts[image.part_of].append(image)
-    return {frame: _frame(adjustment, frame, own) for frame, own in parts.items()}
-
-
-def _frame(adjustment: Adjustment, frame: str, parts: list[Image]) -> JoinedFrameRecord:
-    network, records = adjustment.network, dict[str, PartRecord]()
-    marks, camera_mm = list[PartMarkRecord](), dict[int, Array]()
-    for part in parts:
-        records[part.name], own = _part(adjustment, part, camera_mm)
-        marks += own
-    joins = []
-    for (owner, point), rows in network.joins.items():
-        if owner == frame:
+            parts[image.part_of][image.name], own = _part(adjustment, image, camera_mm)
+            marks[image.part_of] += own
+    joins = defaultdict[str, list[JoinRecord]](list)
+    for (frame, point), rows in network.joins.items():
+        if frame in parts:
             names = tuple(network.observations.image[row] for row in rows)
             first, second = (camera_mm[row] for row in rows.tolist())
             apart_um, middle = UM_PER_MM * (second - first), (first + second) / 2.0
-            joins.append(JoinRecord(point, names, *middle.tolist(), *apart_um.tolist()))
-    return JoinedFrameRecord(records, tuple(joins), tuple(marks))
+            joins[frame].append(JoinRecord(point, names, *middle.tolist(), *apart_um.tolist()))
+    return {frame: JoinedFrameRecord(own, tuple(joins[frame]), tuple(marks[frame])) for frame, own in parts.items()}
 
 
 def _part(adjustment: Adjustment, image: Image, camera_mm: dict[int, Array]) -> tuple[PartRecord, list[PartMarkRecord]]:
@@ -133,20 +126,17 @@ def _part(adjustment: Adjustment, image: Image, camera_mm: dict[int, Array]) -> 
 
 
 def adjustment_record(
-    adjustment: Adjustment,
-    frames_mm: Mapping[str, tuple[float, float]] | None = None,
-    made_from: Mapping[str, str] | None = None,
+    adjustment: Adjustment, frames_mm: Mapping[str, tuple[float, float]], made_from: Mapping[str, str]
 ) -> AdjustmentRecord:
     """Convert an adjustment to its record; parameters as in `write_adjustment`."""
     network, variance = adjustment.network, adjustment.variance
     used = {image.camera for image in network.images}
-    sizes_mm = frames_mm or {}
     reliability, further = adjustment.reliability, _further(adjustment)
     return record_from(
         AdjustmentRecord,
         adjustment,
         reseau=version("reseau"),
-        made_from=dict(made_from or {}),
+        made_from=dict(made_from),
         observations=adjustment.conditions,
         sigma0_from=Sigma0Record(variance.redundancy, variance.is_a_priori, variance.left_out),
         covariance=covariance_note(adjustment),
@@ -160,7 +150,7 @@ def adjustment_record(
         suspects=tuple(map(_suspect, adjustment.suspects)),
         reliability=None if reliability is None else _reliability(reliability, len(network.observations)),
         cameras={
-            camera.name: _camera(adjustment, camera, sizes_mm.get(camera.name))
+            camera.name: _camera(adjustment, camera, frames_mm.get(camera.name))
             for camera in network.cameras
             if camera.name in used
         },
@@ -341,10 +331,12 @@ def _has_solution(adjustment: Adjustment) -> bool:
 def _residuals(adjustment: Adjustment) -> tuple[ResidualRecord, ...]:
     observations, residuals = adjustment.network.observations, adjustment.residuals
     camera_mm = _camera_places(adjustment, observations.xy_mm)
+    w = np.where(np.isfinite(residuals.w), residuals.w, np.nan)
+    larger_axis = np.argmax(np.nan_to_num(np.abs(w), nan=-1.0), axis=1)[:, None]
     columns = [
         UM_PER_MM * residuals.v_mm,
         residuals.redundancy,
-        np.column_stack([list(map(_larger, residuals.w)), residuals.w]),
+        np.column_stack([np.take_along_axis(w, larger_axis, axis=1), residuals.w]),
         adjustment.weights[:, None] if adjustment.weights.size else np.ones((len(observations), 1)),
         UM_PER_MM * np.sqrt(np.diagonal(observations.covariance_mm2, axis1=1, axis2=2)),
         observations.xy_mm,
@@ -368,12 +360,6 @@ def _camera_places(adjustment: Adjustment, xy_mm: Array) -> Array:
     return camera_mm
 
 
-def _larger(w: Array) -> float:
-    """Standardised residual of larger absolute value; NaN if neither axis is checked."""
-    known = w[np.isfinite(w)]
-    return float(known[np.argmax(np.abs(known))]) if known.size else math.nan
-
-
 def _further(adjustment: Adjustment) -> dict[str, list[tuple[str, tuple[float, ...]]]]:
     """Names and numbers of the observations that are no marks, by group; fiducial distances in mm and µm."""
     rows = defaultdict[str, list[tuple[str, tuple[float, ...]]]](list)
@@ -393,31 +379,34 @@ def _contradiction(test: CalibrationTest) -> ContradictionRecord:
 
 
 def _reliability(result: Reliability, marks: int) -> ReliabilityRecord:
-    """Record of the reliability without its first units, the marks: those are in the residuals."""
-    given = [(unit, axis) for unit in range(marks, len(result.tested)) for axis in range(result.sizes[unit])]
+    """Record of the reliability without its first units, the marks: those are in the residuals.
+
+    The smallest detectable error of an unchecked coordinate is infinite.
+    """
+    given = []
+    for unit in range(marks, len(result.tested)):
+        tested = result.tested[unit]
+        for axis in range(result.sizes[unit]):
+            scale, at = _scale(tested, axis), (unit, axis)
+            given.append(
+                TestedGiven(
+                    name=tested.coordinate_name(axis),
+                    group=tested.group,
+                    v=scale * float(result.v[at]),
+                    sigma=scale * float(result.sigma[at]),
+                    redundancy=float(result.redundancy[at]),
+                    w=float(result.w[at]),
+                    tau=float(result.tau[at]),
+                    smallest_error=scale * float(result.smallest[at]),
+                    effect_sigmas=float(result.effect[at]),
+                )
+            )
     return ReliabilityRecord(
         *(result.probabilities.alpha, result.probabilities.power, result.probabilities.family),
         result.critical_tau,
         tuple(OuterRecord(each.parameter.text, each.effect, each.in_sigmas, each.cause) for each in result.outer),
         result.unchecked,
-        tuple(_tested_given(result, unit, axis) for unit, axis in given),
-    )
-
-
-def _tested_given(result: Reliability, unit: int, axis: int) -> TestedGiven:
-    """Test of a given coordinate; the smallest error is infinite if it is unchecked."""
-    tested = result.tested[unit]
-    scale, at = _scale(tested, axis), (unit, axis)
-    return TestedGiven(
-        name=tested.coordinate_name(axis),
-        group=tested.group,
-        v=scale * float(result.v[at]),
-        sigma=scale * float(result.sigma[at]),
-        redundancy=float(result.redundancy[at]),
-        w=float(result.w[at]),
-        tau=float(result.tau[at]),
-        smallest_error=scale * float(result.smallest[at]),
-        effect_sigmas=float(result.effect[at]),
+        tuple(given),
     )
 
 
@@ -438,6 +427,7 @@ def covariance_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
     cameras and images; if these exceed it too, those of cameras. The remaining points (and images) are stored as
     diagonal blocks, without covariances between them: point_names (p, 3), point_values (p, 3), point_matrices
     (p, 3, 3), image_names (i, k) and so on, padded with empty names and zeros for images with fewer than k quantities.
+    cluster_names (k), cluster_matrix (k, k) are of the interior orientations, if an unmodelled error was estimated.
     """
     whole, blocks = _parts(adjustment)
     arrays = _named(adjustment, whole) | {"matrix": adjustment.sigma0**2 * adjustment.cofactor.part(whole)}
@@ -452,16 +442,11 @@ def covariance_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
             matrices[lengths == length, :length, :length] = adjustment.sigma0**2 * cofactors
         named = _named(adjustment, padded) | {"matrices": matrices}
         arrays |= {f"{kind}_{name}": array for name, array in named.items()}
-    return arrays | _cluster_arrays(adjustment)
-
-
-def _cluster_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
-    """cluster_names (k), cluster_matrix (k, k) of the interior orientations, if an unmodelled error was estimated."""
     keys = [key for key in adjustment.parameters if key.kind == "interior"] if adjustment.unmodelled_mm else []
-    matrix = adjustment.cluster_covariance_of(keys) if keys else None
-    if matrix is None:
-        return {}
-    return {"cluster_names": np.array([key.text for key in keys], dtype=np.str_), "cluster_matrix": matrix}
+    clusters = adjustment.cluster_covariance_of(keys) if keys else None
+    if clusters is not None:
+        arrays |= {"cluster_names": np.array([key.text for key in keys], dtype=np.str_), "cluster_matrix": clusters}
+    return arrays
 
 
 def covariance_note(adjustment: Adjustment) -> str:

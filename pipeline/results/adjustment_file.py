@@ -95,20 +95,20 @@ def write_adjustment(
     InputError
         If a file cannot be written.
     """
-    record = adjustment_record(adjustment, frames_mm, made_from)
-    write_with_covariance(path, json_text(record), lambda: covariance_arrays(adjustment))
+    record = adjustment_record(adjustment, frames_mm or {}, made_from or {})
+    write_with_covariance(path, record, lambda: covariance_arrays(adjustment))
 
 
 def write_with_covariance(
-    path: Path, text: Iterable[str], arrays: Callable[[], Mapping[str, NDArray[np.generic]]]
+    path: Path, record: AdjustmentRecord, arrays: Callable[[], Mapping[str, NDArray[np.generic]]]
 ) -> None:
-    """Write the pieces of an adjustment.json, then the arrays of its covariance with its fingerprint.
+    """Write an adjustment.json, then the arrays of its covariance with its fingerprint.
 
     Both files are complete before either is replaced, so that the covariance always matches the adjustment.
     """
     with atomic_path(covariance_path(path)) as covariance, atomic_path(path) as result:
         with result.open("w", encoding="utf-8", newline="\n") as file:
-            file.writelines(text)
+            file.writelines(json_text(record))
         with covariance.open("wb") as data:
             np.savez_compressed(data, allow_pickle=False, fingerprint=np.array(hash_file(result)), **arrays())
 

@@ -24,7 +24,7 @@ COLUMNS = (
     "image", "point", "kind", "x_mm", "y_mm", "sx_mm", "sy_mm", "rho", "col_px", "row_px", "status", "reason",
 )  # fmt: skip
 PIXEL_SIGMAS = ("scol_px", "srow_px")  # columns of files in pixels only; rho then correlates column and row
-_KINDS: dict[str, ObservationKind] = {kind: kind for kind in get_args(ObservationKind)}
+KINDS: dict[str, ObservationKind] = {kind: kind for kind in get_args(ObservationKind)}
 
 CameraPerson = tuple[str, str]  # camera and name of the reviewer
 _DECISIONS = re.compile(r'^"?# (\d+) decisions of (.+), camera (.+?)"?$', re.MULTILINE)
@@ -203,8 +203,8 @@ def _has_pixels_alone(row: Row) -> bool:
 
 def _point(row: Row, pitch_um: tuple[float, float] | None) -> ComparatorPoint:
     kind, status = row.text("kind") or "target", row.text("status") or Status.MEASURED
-    if kind not in _KINDS:
-        raise row.error("kind", f"is {kind!r}; possible are {', '.join(_KINDS)}.")
+    if kind not in KINDS:
+        raise row.error("kind", f"is {kind!r}; possible are {', '.join(KINDS)}.")
     if status not in list(Status):
         raise row.error("status", f"is {status!r}; possible are {', '.join(Status)}.")
     names = ("x_mm", "y_mm", "sx_mm", "sy_mm")
@@ -236,7 +236,7 @@ def _point(row: Row, pitch_um: tuple[float, float] | None) -> ComparatorPoint:
     return ComparatorPoint(
         image=intern(image_name(row.name("image"))),
         point=intern(row.name("point")),
-        kind=_KINDS[kind],
+        kind=KINDS[kind],
         xy_mm=xy,
         sigma_mm=sigma,
         rho=rho,

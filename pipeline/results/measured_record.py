@@ -116,12 +116,12 @@ def scan_detail(measured: MeasuredScan, uri: str) -> dict[str, object]:
         "height_px": measured.height_px,
         "pitch_um": _numbers(measured.pitch_um),
         "failure": measured.failure and {"code": str(measured.failure.code), "sentence": measured.failure.sentence},
-        "pose": frame.pose and pose_record(frame.pose),
+        "pose": frame.pose and plain_json(frame.pose),
         # The text is the chosen reading, for other readers of the database.
         "writing": None if frame.writing is None else [{"text": one.text, **plain_json(one)} for one in frame.writing],
         "pixel_from_camera": _numbers(frame.pixel_from_camera),
         "weights": _numbers(frame.weights),
-        "tone": frame.tone and _frame_tone(frame.tone),
+        "tone": frame.tone and _tone_json(frame.tone),
         "problems": list(frame.problems),
         "problem_codes": [problem.code for problem in frame.problems],
         "notes": list(measured.notes),
@@ -130,20 +130,20 @@ def scan_detail(measured: MeasuredScan, uri: str) -> dict[str, object]:
     return detail | ({"decided_by": dict(measured.reviewers)} if measured.reviewers else {})
 
 
-def read_scan(image: str, detail: Mapping[str, Any], marks: Sequence[MarkMeasurement], scan: str) -> MeasuredScan:
-    """Read the output of `scan_detail`, with the marks. image: name; scan: path or address of the file.
+def read_scan(image: str, detail: Mapping[str, Any], rows: Iterable[Sequence[Any]], scan: str) -> MeasuredScan:
+    """Read the output of `scan_detail`, and rows of its marks. image: name; scan: path or address of the file.
 
     Raises KeyError, TypeError or ValueError for invalid content.
     """
     across, down = detail["pitch_um"]
     frame = FrameMeasurement(
         image=image,
-        marks=tuple(marks),
+        marks=tuple(map(_read_mark, rows)),
         pose=detail["pose"] and _POSE.validate_python(detail["pose"]),
         pixel_from_camera=None if detail["pixel_from_camera"] is None else _array(detail["pixel_from_camera"]),
         problems=tuple(map(Reason.read, detail["problems"], detail["problem_codes"])),
         weights=None if detail["weights"] is None else tuple(map(float, detail["weights"])),
-        tone=detail["tone"] and _read_frame_tone(detail["tone"]),
+        tone=detail["tone"] and _read_tone(detail["tone"]),
         writing=None if detail["writing"] is None else _LINES.validate_python(detail["writing"]),
         notes=tuple(detail.get("frame_notes", ())),
     )
@@ -172,8 +172,8 @@ def mark_row(mark: MarkMeasurement) -> tuple[object, ...]:
     return (mark.point, mark.kind, col, row, *variances, causes, str(mark.status), reason.code, str(reason), quality)
 
 
-def read_mark_row(row: Sequence[Any]) -> MarkMeasurement:
-    """Read a mark from a row. Raises KeyError, TypeError or ValueError for invalid content."""
+def _read_mark(row: Sequence[Any]) -> MarkMeasurement:
+    """Read a mark from a row of MARK_COLUMNS."""
     point, kind, col, row_px, _, _, _, causes, status, code, reason, quality = row
     parts = json.loads(causes)["of"] if causes else None
     return MarkMeasurement(
@@ -230,34 +230,21 @@ def _array(values: Any) -> Array:
     return np.array(values, dtype=np.float64)
 
 
-def pose_record(pose: ScanOrientation) -> dict[str, object]:
-    """Scan orientation (pose) with its evidence, as JSON."""
-    record: dict[str, object] = plain_json(pose)
-    return record
-
-
-def _frame_tone(tone: FrameTone) -> dict[str, object]:
-    """JSON of a tone, its curve as its name where it has one."""
-    return {**plain_json(tone), "tone": {**plain_json(tone.tone), "base": _base(tone.tone.base)}}
-
-
-def _read_frame_tone(tone: Mapping[str, Any]) -> FrameTone:
-    return read_plain(FrameTone, {**tone, "tone": {**tone["tone"], "base": _read_base(tone["tone"]["base"])}})
-
-
-def _base(base: Array) -> Any:
-    """Tone curve as its exponent, the name of sRGB, or its table of values."""
+def _tone_json(tone: FrameTone) -> dict[str, object]:
+    """JSON of a tone, its curve as its exponent, the name of sRGB, or its table of values."""
+    base = tone.tone.base
     middle = len(base) // 2
     exponent = round(float(np.log(base[middle]) / np.log(middle / (len(base) - 1))), 9)
+    curve = _SRGB if np.array_equal(base, srgb()) else _numbers(base)
     if np.array_equal(base, power(exponent)):
-        return exponent
-    return _SRGB if np.array_equal(base, srgb()) else _numbers(base)
+        curve = exponent
+    return {**plain_json(tone), "tone": {**plain_json(tone.tone), "base": curve}}
 
 
-def _read_base(base: Any) -> Array:
-    if base == _SRGB:
-        return srgb()
-    return _array(base) if isinstance(base, list) else power(float(base))
+def _read_tone(tone: Mapping[str, Any]) -> FrameTone:
+    curve = tone["tone"]["base"]
+    base = srgb() if curve == _SRGB else _array(curve) if isinstance(curve, list) else power(float(curve))
+    return read_plain(FrameTone, {**tone, "tone": {**tone["tone"], "base": base}})
 
 
 COLUMNS = ("image", "field", "text", "value", "confidence", "place", "col_px", "row_px")
@@ -269,7 +256,15 @@ HEAD = """# written about the frames, reseau {version}: as far as it was read. p
 
 def write_frames(path: Path, scans: Iterable[MeasuredScan]) -> bool:
     """Write frames.csv if any writing was read; returns whether it was. Raises InputError if writing fails."""
-    rows = [csv_line(row) for scan in scans for row in _rows(scan.frame)]
+    rows = list[str]()
+    for scan in scans:
+        lines = scan.frame.writing or ()
+        known = find_fields(lines)
+        for line in lines:
+            col, row = line.center_px
+            place = (f"{line.confidence:.2f}", line.side, f"{col:.0f}", f"{row:.0f}")
+            for each in [one for one in known if one.line is line] or [Field("text", line.text, "", line)]:
+                rows.append(csv_line((scan.frame.image, each.name, each.text, each.value, *place)))
     if rows:
         write_atomically(path, HEAD.format(version=version("reseau")) + "\n".join([csv_line(COLUMNS), *rows]) + "\n")
     return bool(rows)
@@ -278,18 +273,6 @@ def write_frames(path: Path, scans: Iterable[MeasuredScan]) -> bool:
 def for_images(scans: Iterable[MeasuredScan], names: Sequence[str]) -> Mapping[str, Mapping[str, str]]:
     """Values of the named fields by image."""
     return {scan.frame.image: unique_fields(scan.frame.writing or (), names) for scan in scans}
-
-
-def _rows(frame: FrameMeasurement) -> list[tuple[str, ...]]:
-    rows = list[tuple[str, ...]]()
-    lines = frame.writing or ()
-    fields = find_fields(lines)
-    for line in lines:
-        own = [field for field in fields if field.line is line] or [Field("text", line.text, "", line)]
-        col, row = line.center_px
-        place = (f"{line.confidence:.2f}", line.side, f"{col:.0f}", f"{row:.0f}")
-        rows += [(frame.image, field.name, field.text, field.value, *place) for field in own]
-    return rows
 
 
 def unique_fields(lines: Sequence[Line], names: Sequence[str]) -> dict[str, str]:

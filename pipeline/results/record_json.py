@@ -8,7 +8,7 @@ such a number that is not negative; `Finite` is never null. A field with default
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import MISSING, Field, fields, is_dataclass, make_dataclass
+from dataclasses import MISSING, fields, is_dataclass, make_dataclass
 from functools import cache
 from itertools import islice
 from pathlib import Path
@@ -212,8 +212,7 @@ def _fields(kind: type) -> tuple[tuple[str, str, Any], ...]:
     if not is_dataclass(kind):  # a named tuple
         named: Any = kind
         return tuple((name, name, named._field_defaults.get(name, MISSING)) for name in named._fields)
-    return tuple((each.name, name_in_file(each), _default(each)) for each in fields(kind))
-
-
-def _default(field: Field[Any]) -> Any:
-    return field.default if field.default_factory is MISSING else field.default_factory
+    return tuple(
+        (each.name, name_in_file(each), each.default if each.default_factory is MISSING else each.default_factory)
+        for each in fields(kind)
+    )

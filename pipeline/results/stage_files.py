@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from adjust.model_selection.model_choice import Candidate, Choice, Model
-from adjust.quality.lens_comparison import CameraCalibration, Comparison, Test, sigmas
+from adjust.quality.lens_comparison import Comparison, Test, sigmas
 from pipeline.results.record_json import Finite, Number, Sigma, Whole, read_record
 from pipeline.types import Array
 
@@ -226,23 +226,8 @@ def comparison_record(comparison: Comparison, remarks: Sequence[str], level: flo
 
 
 def _difference(comparison: Comparison, number: int) -> CalibrationDifference:
-    first, *others = comparison.calibrations
-    marks = zip(
-        comparison.fiducials,
-        comparison.fiducials_um[number],
-        sigmas(comparison.fiducials_covariance_um2[number]),
-        strict=True,
-    )
-    return CalibrationDifference(
-        parameters=_parameter_differences(first, others[number]),
-        field_um=comparison.field_um[number],
-        field_sigma_um=sigmas(comparison.field_covariance_um2[number]),
-        fiducials={id: {"um": um, "sigma_um": sigma_um} for id, um, sigma_um in marks},
-    )
-
-
-def _parameter_differences(first: CameraCalibration, other: CameraCalibration) -> list[ParameterDifference]:
-    """Differences of the parameters that both calibrations have."""
+    """Differences of a calibration, those of the parameters that it shares with the first one."""
+    first, other = comparison.calibrations[0], comparison.calibrations[number + 1]
     alike = first.lens.distortion.family == other.lens.distortion.family
     values = [each.lens.values for each in (first, other)]
     deviations = [np.sqrt(np.diag(each.covariance)) for each in (first, other)]
@@ -252,4 +237,11 @@ def _parameter_differences(first: CameraCalibration, other: CameraCalibration) -
         before, after = float(values[0][k]), float(values[1][k])
         size = (after - before) / joint if joint > 0 else np.nan
         rows.append(ParameterDifference(name, before, after, after - before, joint, size))
-    return rows
+    marks_sigma_um = sigmas(comparison.fiducials_covariance_um2[number])
+    marks = zip(comparison.fiducials, comparison.fiducials_um[number], marks_sigma_um, strict=True)
+    return CalibrationDifference(
+        parameters=rows,
+        field_um=comparison.field_um[number],
+        field_sigma_um=sigmas(comparison.field_covariance_um2[number]),
+        fiducials={id: {"um": um, "sigma_um": sigma_um} for id, um, sigma_um in marks},
+    )

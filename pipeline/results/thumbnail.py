@@ -62,11 +62,16 @@ ThumbnailRow = tuple[str, str, float, float, float, bytes]  # point, kind, colum
 
 def thumbnail_rows(scan: Scan, measured: MeasuredScan) -> list[ThumbnailRow]:
     """Thumbnails of the marks of an open scan, and of the whole scan if a reduced image was decoded."""
-    cuts: list[tuple[tuple[str, str], Thumbnail | None]]
-    cuts = [((mark.point, mark.kind), cut(scan, mark)) for mark in measured.frame.marks]
+    marks = measured.frame.marks
+    rows = [thumbnail.row(mark.point, mark.kind) for mark in marks if (thumbnail := cut(scan, mark))]
     if scan.last_reduction is not None:
-        cuts.insert(0, (WHOLE, _reduced(*scan.last_reduction)))
-    return [each.row(*name) for name, each in cuts if each]
+        factor, grey = scan.last_reduction  # each pixel of `grey` covers `factor` pixels a side
+        step = max(1, -(-max(grey.shape) // _WHOLE_PX))
+        size = grey.shape[1] // step, grey.shape[0] // step
+        pixels = cv2.resize(grey[: size[1] * step, : size[0] * step], size, interpolation=cv2.INTER_AREA)
+        whole = Thumbnail(np.asarray(pixels), ((factor * step - 1) / 2.0,) * 2, float(factor * step))
+        rows.insert(0, whole.row(*WHOLE))
+    return rows
 
 
 def cut(scan: Scan, mark: MarkMeasurement) -> Thumbnail | None:
@@ -86,11 +91,3 @@ def cut(scan: Scan, mark: MarkMeasurement) -> Thumbnail | None:
     pixels = cv2.resize(window[: size * step, : size * step], (size, size), interpolation=cv2.INTER_AREA)
     middle = (step - 1) / 2.0
     return Thumbnail(np.asarray(pixels), (col0 + middle, row0 + middle), float(step))
-
-
-def _reduced(factor: int, grey: NDArray[np.float32]) -> Thumbnail:
-    """Thumbnail of a whole scan, of which each pixel of `grey` covers `factor` pixels a side."""
-    step = max(1, -(-max(grey.shape) // _WHOLE_PX))
-    size = grey.shape[1] // step, grey.shape[0] // step
-    pixels = cv2.resize(grey[: size[1] * step, : size[0] * step], size, interpolation=cv2.INTER_AREA)
-    return Thumbnail(np.asarray(pixels), ((factor * step - 1) / 2.0,) * 2, float(factor * step))

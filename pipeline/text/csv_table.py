@@ -79,12 +79,12 @@ class Row:
 def csv_line(cells: Sequence[str]) -> str:
     """Format cells as a line of CSV without line end, which `read_csv` reads back unchanged. Cells are quoted if
     necessary, also if the line would otherwise be a comment."""
-    texts = (f"'{cell}" if _FORMULA.match(cell) and not _NO_FORMULA.fullmatch(cell) else cell for cell in cells)
-    return ",".join(map(_quoted, texts))
-
-
-def _quoted(cell: str) -> str:
-    return '"' + cell.replace('"', '""') + '"' if cell.startswith("#") or any(c in cell for c in ',"\n') else cell
+    written = []
+    for cell in cells:
+        text = f"'{cell}" if _FORMULA.match(cell) and not _NO_FORMULA.fullmatch(cell) else cell
+        needs_quotes = text.startswith("#") or any(letter in text for letter in ',"\n')
+        written.append('"' + text.replace('"', '""') + '"' if needs_quotes else text)
+    return ",".join(written)
 
 
 def read_csv(path: FilePath, required: Sequence[str], optional: Sequence[str] = ()) -> Iterator[Row]:
@@ -92,19 +92,24 @@ def read_csv(path: FilePath, required: Sequence[str], optional: Sequence[str] = 
     line."""
     path = Path(path)
     try:
-        data = read_bytes(path)
+        lines = enumerate(read_bytes(path).decode("utf-8-sig").splitlines(), 1)
     except FileNotFoundError:
         raise InputError(no_such_file(path)) from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; a CSV file is needed here. Name one.") from None
-    lines = _content_lines(data, path)
-    first = next(lines, None)
-    if first is None:
-        raise InputError(f"{path}: is empty; its first line must name the columns: {','.join(required)}.")
-    header = _cells(path, *first)
-    _check_header(path, first[0], header, required, optional)
+    except UnicodeDecodeError:
+        raise InputError(
+            f"{path}: is not text in UTF-8. Save it as such: in a spreadsheet as CSV UTF-8, separated by commas."
+        ) from None
+    header: list[str] = []
     for number, text in lines:
+        if not text.strip() or text.lstrip().startswith("#"):
+            continue
         cells = _cells(path, number, text)
+        if not header:
+            header = cells
+            _check_header(path, number, header, required, optional)
+            continue
         if len(cells) > len(header) and any(cells[len(header) :]):
             raise InputError(
                 f"{path}, line {number}: has {len(cells)} values, but the header names {len(header)} columns. "
@@ -116,6 +121,8 @@ def read_csv(path: FilePath, required: Sequence[str], optional: Sequence[str] = 
                 "names. Complete it; a value that is not given is left blank between its commas."
             )
         yield Row(path, number, dict(zip(header, cells, strict=False)))
+    if not header:
+        raise InputError(f"{path}: is empty; its first line must name the columns: {','.join(required)}.")
 
 
 def _cells(path: Path, line: int, text: str) -> list[str]:
@@ -124,18 +131,6 @@ def _cells(path: Path, line: int, text: str) -> list[str]:
         return [cell[1:] if _TAKEN_FOR_TEXT.match(cell) else cell for cell in cells]
     except csv.Error as error:
         raise InputError(f"{path}, line {line}: is no line of CSV ({error}). Mend it.") from None
-
-
-def _content_lines(data: bytes, path: Path) -> Iterator[tuple[int, str]]:
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(
-            f"{path}: is not text in UTF-8. Save it as such: in a spreadsheet as CSV UTF-8, separated by commas."
-        ) from None
-    for number, line in enumerate(text.splitlines(), 1):
-        if line.strip() and not line.lstrip().startswith("#"):
-            yield number, line
 
 
 def _check_header(

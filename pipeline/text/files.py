@@ -171,17 +171,16 @@ def path_below(folder: Path, name: str, suffix: str = "") -> Path:
     Raises InputError for a name that would lead out of the folder, or that is no valid file name on some system.
     """
     parts = name.split("/")
-    if not name.isprintable() or any(map(_leads_elsewhere, parts)):
+    if not name.isprintable() or any(
+        part.strip() in ("", ".", "..") or "\\" in part or part[1:2] == ":"  # a Windows drive
+        for part in parts
+    ):
         raise InputError(
             f"the name {quote_value(name)} cannot be that of a file below {folder}: nothing was written. A name is a "
             "file's, with folders before it and `/` between, without .. and backslash. Rename the image, frame or "
             "camera."
         )
     return folder.joinpath(*parts[:-1], f"{parts[-1]}{suffix}")
-
-
-def _leads_elsewhere(part: str) -> bool:
-    return part.strip() in ("", ".", "..") or "\\" in part or part[1:2] == ":"  # a Windows drive
 
 
 def file_word(name: str) -> str:

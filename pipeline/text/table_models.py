@@ -38,6 +38,7 @@ from pipeline.text.wording import LISTED, did_you_mean, nearest
 Model = TypeVar("Model")
 
 FREE = "free"
+_NO_TABLES = "must be written as [[{table}]], once for each."
 _MANY_KEYS = 3  # a file with more keys, and fewer that are known, is of another kind
 _UNITS = {"mm": "mm", "um": "µm", "deg": "°", "px": "px", "ppm": "ppm", "urad": "µrad", "dm": "dm"}
 _LONGEST_PATH, _LONGEST_NAME = 4000, 255  # bytes, limits of most file systems
@@ -73,6 +74,15 @@ def texts(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list | tuple) or not all(isinstance(item, str) for item in value):
         raise ValueError(f'must be a list of texts, ["...", "..."], not {quote_value(value)}.')
     return tuple(value)
+
+
+def known_name(value: Any, find: Callable[[str], object], names: Collection[str]) -> str:
+    """Read a text for which `find` raises no ValueError. names: those that it may resemble. Raises ValueError."""
+    try:
+        find(text(value))
+    except ValueError as error:
+        raise ValueError(f"{error}.{did_you_mean(value, names)}") from None
+    return str(value)
 
 
 def _path(value: Any) -> str:
@@ -175,7 +185,7 @@ def _values(value: Any) -> Mapping[str, Any]:
 
 def _entries(value: Any) -> Sequence[Any]:
     if not isinstance(value, list | tuple) or not all(isinstance(item, dict) for item in value):
-        raise ValueError("must be written as [[{table}]], once for each.")
+        raise ValueError(_NO_TABLES)
     return value
 
 
@@ -320,7 +330,11 @@ def _message(root: Table, model: type, error: ValidationError) -> str:
         if kind == "missing":
             return _missing(table, key, _keys(own))
         cause = each.get("ctx", {}).get("error")
-        text = str(cause) if isinstance(cause, ValueError) else _wrong_form(kind, table.values.get(key))
+        text = f"must be a table, [{{table}}], not {quote_value(table.values.get(key))}."
+        if isinstance(cause, ValueError):
+            text = str(cause)
+        elif kind == "tuple_type" or isinstance(table.values.get(key), list):
+            text = _NO_TABLES
         key = cause.key if isinstance(cause, WrongKey) else key
         text = text.replace("{key}", key).replace("{table}", table.inside(key))
         return str(table.error(key, text)) if key else f"{root.file}: {text}. Correct the file."
@@ -332,13 +346,6 @@ def _message(root: Table, model: type, error: ValidationError) -> str:
     if len(unknown) > LISTED:
         lines.append(f"{root.file}: {len(unknown) - LISTED} more keys are not known.")
     return "\n".join(lines) or f"{root.file}: {error}"
-
-
-def _wrong_form(kind: str, value: Any) -> str:
-    """Message on a value that should be a table, or tables."""
-    if kind == "tuple_type" or isinstance(value, list):
-        return "must be written as [[{table}]], once for each."
-    return f"must be a table, [{{table}}], not {quote_value(value)}."
 
 
 def _missing(table: Table, key: str, known: Collection[str]) -> str:

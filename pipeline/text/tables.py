@@ -12,6 +12,7 @@ from pipeline.text.wording import did_you_mean
 
 MOST_MB = 4  # size of a camera file with marks learned from 12,000 scans
 
+_NO_TOML = "It holds none; `reseau template` prints one to start from."
 _DEEP = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++\s*+\.\s*+){30}""")
 _BARE = re.compile(
     r"""\s*(?P<key>[\w."'-]+)\s*=\s*(?:(?P<word>[A-Za-z][\w./-]*)|(?P<number>[+-]?\d[\d.]*)\s*[A-Za-zµμ°%]+)\s*(?:\#.*)?$"""
@@ -21,20 +22,18 @@ _BARE = re.compile(
 def read_toml(path: FilePath) -> "Table":
     """Read the root table of a TOML file. Raises InputError for a missing file, invalid UTF-8, or a syntax error."""
     path = Path(path)
-    return Table(_parse(path), path, "")
-
-
-def _parse(path: Path) -> dict[str, Any]:
     try:
         text = read_bytes(path, MOST_MB).decode("utf-8-sig")
         if deep := _DEEP.search(text):
             line = text.count("\n", 0, deep.start()) + 1
             raise InputError(f"{path}, line {line}: joins more names by points than any table here. Mend that line.")
-        return tomllib.loads(text)
+        return Table(tomllib.loads(text), path, "")
     except FileNotFoundError:
         raise InputError(no_such_file(path)) from None
     except IsADirectoryError:
-        raise InputError(f"{path}: is a folder; a TOML file is needed here. {_toml_files_sentence(path)}") from None
+        files = ", ".join(map(str, sorted(path.glob("*.toml"))))
+        hint = f"Name one that it holds: {files}." if files else _NO_TOML
+        raise InputError(f"{path}: is a folder; a TOML file is needed here. {hint}") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: is not text in UTF-8; a TOML file, saved as such, is needed here.") from None
     except RecursionError:
@@ -61,13 +60,6 @@ def _mending(text: str, error: str) -> str:
     if found:
         return f"A number stands without its unit, which the key names: {found['key']} = {found['number']}."
     return "Mend that line."
-
-
-def _toml_files_sentence(folder: Path) -> str:
-    files = sorted(folder.glob("*.toml"))
-    if not files:
-        return "It holds none; `reseau template` prints one to start from."
-    return f"Name one that it holds: {', '.join(map(str, files))}."
 
 
 class Table:

@@ -249,7 +249,7 @@ RICH = measured_record.MeasuredScan(
 
 def again(scan: measured_record.MeasuredScan, folder: Path = Path("/out")) -> measured_record.MeasuredScan:
     text = json.dumps(measured_record.scan_detail(scan, "../scans/roll 7/a.tif"), allow_nan=False)
-    marks = [measured_record.read_mark_row(measured_record.mark_row(mark)) for mark in scan.frame.marks]
+    marks = [measured_record.mark_row(mark) for mark in scan.frame.marks]
     detail = json.loads(text)
     return measured_record.read_scan(
         scan.frame.image, detail, marks, measured_record.scan_location(detail["scan"], folder)
@@ -320,7 +320,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def find_scans_case(folder: Path, *patterns: str, exclude: tuple[str, ...] = ()) -> list[str]:
-    files = find_scans(Table({}, folder / "project.toml", ""), patterns, exclude).files.values()
+    files = find_scans(Table({}, folder / "project.toml", ""), patterns, exclude)[0].values()
     return sorted(os.path.relpath(file, folder) for file in files)
 
 
