@@ -16,7 +16,7 @@ from measure.scans.remote import Address, is_address, scan_path
 from pipeline.archive import scan_groups
 from pipeline.errors import InputError
 from pipeline.files.camera_file import read_camera
-from pipeline.files.library import PREFIX, camera_words, library_path, read_library
+from pipeline.files.library import PREFIX, library_path, read_library
 from pipeline.progress import Reporter
 from pipeline.text.csv_table import csv_line
 from pipeline.text.files import check_writable, image_name, names_below, write_atomically
@@ -24,7 +24,6 @@ from pipeline.text.wording import count_sentence, counted, listed, quoted
 from pipeline.workers import worker_pool
 
 OUTPUT = "out"
-_LIST = ".txt"
 _SHOWN = 12  # remarks of each kind on the terminal
 _BROKEN = "cannot be read"
 _COPIES = "the same bytes as another scan"
@@ -217,7 +216,7 @@ def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pi
 
 def _given_paths(given: Path) -> list[Path]:
     """The path itself, or the entries of a list file: one path or address per line."""
-    if isinstance(given, Address) or given.suffix.lower() != _LIST or not given.is_file():
+    if isinstance(given, Address) or given.suffix.lower() != ".txt" or not given.is_file():
         return [given]
     lines = [line.strip() for line in given.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()]
     named = [line for line in lines if line and not line.startswith("#")]
@@ -352,6 +351,17 @@ def _place(group: scan_groups.ScanGroup) -> str:
 
 
 def _candidate_lines(names: Sequence[str]) -> list[str]:
-    """One line for each camera of the library, with what distinguishes it."""
-    library = {name: read_camera(library_path(name)) for name in names}
-    return [f"    {name}: {camera_words(camera)}" for name, camera in library.items()]
+    """One line for each camera of the library, with what distinguishes it: frame, principal distance, marks, source of
+    its numbers."""
+    lines = []
+    for name in names:
+        camera = read_camera(library_path(name))
+        frame_mm = " x ".join(f"{side:g}" for side in camera.frame_mm or ())
+        places = [one.xy_mm for one in camera.fiducials]
+        corners = sum(abs(x) > 0.5 * abs(y) and abs(y) > 0.5 * abs(x) for x, y in places)
+        counts = ((corners, "corner"), (len(places) - corners, "side"))
+        marks = " and ".join(f"{number} {word}" for number, word in counts if number)
+        c_mm = f"c {camera.principal_distance_mm:.1f} mm, " if camera.principal_distance_mm else ""
+        source = camera.source.text if camera.source else "no source"
+        lines.append(f"    {name}: frame {frame_mm} mm, {c_mm}{marks} marks, {source}")
+    return lines

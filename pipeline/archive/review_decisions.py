@@ -21,8 +21,6 @@ from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import did_you_mean
 
 _MEASURED = (Choice.PLACE, Choice.POSE, Choice.UNDO)  # decisions that change the measurement
-KeyOf = Callable[[ScanTask], str]
-PoseOf = Callable[[str], str | None]
 _INAPPLICABLE = "decisions that do not apply"
 _NAMED = 10
 
@@ -74,7 +72,10 @@ def decisions_hash(decisions: Sequence[Decision]) -> str:
 
 
 def apply_decisions(
-    task: ScanTask, decisions: Sequence[Decision], key_of: KeyOf, pose_of: PoseOf
+    task: ScanTask,
+    decisions: Sequence[Decision],
+    key_of: Callable[[ScanTask], str],
+    pose_of: Callable[[str], str | None],
 ) -> tuple[ScanTask, Mapping[About, Decision]]:
     """Apply decisions to the task of their scan; return it, and the decisions that apply, by subject.
 

@@ -21,8 +21,6 @@ from pipeline.results.measured_record import MARK_COLUMNS
 STORE_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # damaged files: even SQLite's message may be undecodable
 APPLICATION = 0x52455345  # "RESE": identifies the file for `file` and this program
 MARKS = ", ".join(("number", *MARK_COLUMNS))
-_BYTES = 16
-
 _FIRST = """
 create table scan (
     id integer primary key,
@@ -119,7 +117,7 @@ where judging = (select max(id) from judging where digest not like 'unfinished%'
 def row_digest(*values: Any) -> str:
     """BLAKE2b (hexadecimal) of a row's values as JSON, numbers with all their digits."""
     text = json.dumps(values, separators=(",", ":"), default=lambda data: {"bytes": data.hex()})
-    return hashlib.blake2b(text.encode("ascii"), digest_size=_BYTES).hexdigest()
+    return hashlib.blake2b(text.encode("ascii"), digest_size=16).hexdigest()
 
 
 class _RowsDigest:

@@ -36,12 +36,7 @@ class Work:
     """Measurement of scans on request: stored results are read, missing ones measured and stored at once."""
 
     def __init__(
-        self,
-        project: Project,
-        store: Store,
-        executor: Executor,
-        options: WorkOptions,
-        thumbnails: ThumbnailStore,
+        self, project: Project, store: Store, executor: Executor, options: WorkOptions, thumbnails: ThumbnailStore
     ) -> None:
         self._project, self._store, self._executor, self._thumbnails = project, store, executor, thumbnails
         self._at_a_time = options.workers or os.cpu_count() or 1

@@ -45,29 +45,23 @@ class EarlierCalibration:
     def applied(self, camera: Camera) -> tuple[Camera, Calibration]:
         """The camera, with priors removed where the calibration replaces them, and the calibration for the network."""
         here = tuple(each._replace(owner=camera.name) for each in self.parameters)
-        given = dict(zip(here, self.values.tolist(), strict=True))
+        given = {(each.id, each.quantity): value for each, value in zip(here, self.values.tolist(), strict=True)}
 
-        def prior(parameter: Parameter, otherwise: Prior | None) -> Prior | None:
-            return Prior(given[parameter], np.inf) if parameter in given else otherwise
-
-        def interior(name: str, otherwise: Prior | None) -> Prior | None:
-            return prior(Parameter.interior(camera.name, name), otherwise)
-
-        def place(id: str, axis: str, otherwise: Prior) -> Prior:
-            return prior(Parameter.fiducial(camera.name, id, axis), otherwise) or otherwise
+        def prior(id: str, quantity: str, otherwise: Prior | None) -> Prior | None:
+            return Prior(given[id, quantity], np.inf) if (id, quantity) in given else otherwise
 
         distortion = {}
         for name in parameter_names(camera.distortion.family):
             otherwise = camera.distortion.parameters.get(name, Prior(0.0, 0.0))
-            distortion[name] = interior(name, otherwise) or otherwise
+            distortion[name] = prior("", name, otherwise) or otherwise
         free = replace(
             camera,
-            principal_distance_mm=interior("c", camera.principal_distance_mm),
-            x0_mm=interior("x0", camera.x0_mm),
-            y0_mm=interior("y0", camera.y0_mm),
+            principal_distance_mm=prior("", "c", camera.principal_distance_mm),
+            x0_mm=prior("", "x0", camera.x0_mm),
+            y0_mm=prior("", "y0", camera.y0_mm),
             distortion=replace(camera.distortion, parameters=distortion),
             fiducials={
-                id: Fiducial(place(id, "x", mark.x_mm), place(id, "y", mark.y_mm))
+                id: Fiducial(prior(id, "x", mark.x_mm) or mark.x_mm, prior(id, "y", mark.y_mm) or mark.y_mm)
                 for id, mark in camera.fiducials.items()
             },
         )

@@ -54,16 +54,6 @@ def read_library() -> dict[str, CameraFile]:
     return {name: read_camera(library_path(name)) for name in library_names()}
 
 
-def camera_words(camera: CameraFile) -> str:
-    """Text that distinguishes a camera: frame, principal distance, marks, source of its numbers."""
-    frame_mm = " x ".join(f"{side:g}" for side in camera.frame_mm or ())
-    corners = sum(abs(x) > 0.5 * abs(y) and abs(y) > 0.5 * abs(x) for x, y in (one.xy_mm for one in camera.fiducials))
-    sides = len(camera.fiducials) - corners
-    marks = " and ".join(f"{number} {word}" for number, word in ((corners, "corner"), (sides, "side")) if number)
-    c_mm = f"c {camera.principal_distance_mm:.1f} mm, " if camera.principal_distance_mm else ""
-    return f"frame {frame_mm} mm, {c_mm}{marks} marks, {camera.source.text if camera.source else 'no source'}"
-
-
 def library_json() -> list[Json]:
     return [
         {

@@ -90,11 +90,6 @@ class LearnedFrom:
     alike: tuple[str, ...] = ()
 
 
-# Template of a mark in a camera file, with its images in files beside it: `[mark.NAME]` of kind "template".
-#
-# `[mark.NAME.learned]` holds what was learned from scans; a manually cut chip has no such table.
-
-
 def picture_writer(folder: Path, prefix: str = "") -> SavePicture:
     """Function that stores images in a folder, under names that begin with the prefix."""
 
@@ -207,7 +202,8 @@ class FrameCornerTable(PaintedTable):
 
 @models.table_model
 class LearnedPicture:
-    """[mark.NAME.learned]: properties of a template estimated from scans, as the program writes them."""
+    """[mark.NAME.learned]: properties of a template estimated from scans, as the program writes them. A manually cut
+    chip has none."""
 
     size_mm: models.Positive
     range_dn: models.Positive

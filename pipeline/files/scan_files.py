@@ -83,9 +83,6 @@ def each_once(files: Mapping[str, bool], without: Iterable[str]) -> set[str]:
     return set(kept.values())
 
 
-# Scans that a project names: files, addresses and patterns at any depth; names of their images.
-
-
 class ScanFiles(Mapping[str, Path]):
     """Paths by image name. A Path is created on access: creating fifty thousand takes longer than finding the files."""
 

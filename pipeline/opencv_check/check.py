@@ -48,13 +48,13 @@ from pipeline.opencv_check.opencv_calibration import (
     opencv_values,
     to_opencv_model,
 )
+from pipeline.results.adjustment_record import Quantity
 from pipeline.results.comparator_file import comparator_from_pixel
 from pipeline.results.stage_files import (
     CameraCheck,
     Check,
     ComparedParameter,
     CornersCheck,
-    Estimate,
     PixelCalibration,
     Verdict,
 )
@@ -408,8 +408,8 @@ def _rows(
         ComparedParameter.from_numbers(
             name,
             "mm" if name in INTERIOR else "rad" if name in ("tau_x", "tau_y") else "1",
-            Estimate(float(conversion.parameters[k]), float(sigma0 * conversion.sigmas[k])),
-            Estimate(float(opencv.parameters[k]), float(opencv.sigmas[k])),
+            Quantity(float(conversion.parameters[k]), float(sigma0 * conversion.sigmas[k])),
+            Quantity(float(opencv.parameters[k]), float(opencv.sigmas[k])),
         )
         for k, name in enumerate(names)
         if name in freedom.names

@@ -14,7 +14,7 @@ from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.camera import Camera
 from adjust.problem.estimates import adjusted_image, observed_places
-from adjust.problem.network import EXTERIOR_NAMES, Image, ObjectPoint
+from adjust.problem.network import EXTERIOR_NAMES, Board, Image, ObjectPoint
 from adjust.problem.parameter import Kind, Parameter
 from adjust.quality.critical_values import Tested
 from adjust.quality.lens_uncertainty import projection_uncertainty
@@ -59,12 +59,12 @@ from pipeline.results.assessment_record import (
     SuspectRecord,
     TestedGiven,
 )
+from pipeline.results.image_unit import UM_PER_MM
 from pipeline.results.record_json import record_from
 from pipeline.types import Array, Indices
 
 ANGLES = ("omega", "phi", "kappa", "angle")
 DEG_PER_RAD = 180.0 / math.pi
-UM_PER_MM = 1e3
 MOST_IMAGES = 500  # in larger networks projection_uncertainty takes too long to run with every adjustment
 AFFORDABLE = 3000  # largest number of quantities whose covariance is written as one matrix
 
@@ -163,7 +163,7 @@ def adjustment_record(
             )
             for each in network.scanners
         },
-        boards={each.name: _board(adjustment, number) for number, each in enumerate(network.boards)},
+        boards={each.name: _board(adjustment, each) for each in network.boards},
         images={image.name: _image(adjustment, image) for image in network.images},
         frames=joined_frames(adjustment),
         points={
@@ -199,8 +199,10 @@ def _camera(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, float
     tests, together = _tests(adjustment, "interior", camera.name)
 
     def quantity(name: str, given: Prior | None) -> Quantity:
-        known = _quantity(adjustment, Parameter.interior(camera.name, name), given)
-        return replace(known, sigma=math.nan) if is_idle else _tested(known, tests.get(name))
+        parameter = Parameter.interior(camera.name, name)
+        if is_idle:
+            return replace(_quantity(adjustment, parameter, given), sigma=math.nan)
+        return _quantity(adjustment, parameter, given, test=tests.get(name))
 
     given = camera.distortion.parameters
     parameters = {key: quantity(key, given.get(key, Prior(0.0))) for key in parameter_names(camera.distortion.family)}
@@ -236,8 +238,7 @@ def _projection(adjustment: Adjustment, camera: str) -> Iterator[ProjectionRecor
         yield ProjectionRecord(distance, tuple(x_mm.tolist()), tuple(y_mm.tolist()), tuple(map(tuple, sigma_um)))
 
 
-def _board(adjustment: Adjustment, number: int) -> BoardRecord:
-    board = adjustment.network.boards[number]
+def _board(adjustment: Adjustment, board: Board) -> BoardRecord:
     bends = dict(zip(board.names, board.bends, strict=True))
     terms, together = _terms(adjustment, "board", board.name, bends)
     return BoardRecord(points=len(board.places), terms=terms, significance=together)
@@ -249,7 +250,7 @@ def _terms(
     """Terms with their significance tests, and the tests of groups."""
     tests, together = _tests(adjustment, kind, owner)
     quantities = {
-        name: _tested(_quantity(adjustment, Parameter(kind, owner, "", name), prior), tests.get(name))
+        name: _quantity(adjustment, Parameter(kind, owner, "", name), prior, test=tests.get(name))
         for name, prior in terms.items()
     }
     return quantities, together
@@ -262,10 +263,6 @@ def _tests(
     tests = adjustment.significance.get((kind, owner), ())
     groups = (GroupTestRecord(each.name, each.parameters, each.statistic, each.p) for each in tests if each.is_group)
     return {each.name: each for each in tests if not each.is_group}, tuple(groups)
-
-
-def _tested(quantity: Quantity, test: SignificanceTest | None) -> Quantity:
-    return quantity if test is None else replace(quantity, t=test.statistic, p=test.p)
 
 
 def _image(adjustment: Adjustment, image: Image) -> ImageRecord:
@@ -309,12 +306,20 @@ def _point(adjustment: Adjustment, point: ObjectPoint) -> PointRecord:
     return PointRecord(**place)
 
 
-def _quantity(adjustment: Adjustment, parameter: Parameter, given: Prior | None = None, scale: float = 1.0) -> Quantity:
+def _quantity(
+    adjustment: Adjustment,
+    parameter: Parameter,
+    given: Prior | None = None,
+    scale: float = 1.0,
+    test: SignificanceTest | None = None,
+) -> Quantity:
     """Value and a-posteriori sigma; NaN without a solution, since zero means that the quantity was fixed."""
     return Quantity(
         value=scale * adjustment.value(parameter),
         sigma=scale * adjustment.sigma(parameter) if _has_solution(adjustment) else math.nan,
         given=None if given is None else GivenQuantity(scale * given.value, scale * given.sigma),
+        t=None if test is None else test.statistic,
+        p=None if test is None else test.p,
     )
 
 

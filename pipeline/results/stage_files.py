@@ -12,18 +12,11 @@ import numpy as np
 
 from adjust.model_selection.model_choice import Candidate, Choice, Model
 from adjust.quality.lens_comparison import Comparison, Test, sigmas
-from pipeline.results.record_json import Finite, Number, Sigma, Whole, read_record
+from pipeline.results.adjustment_record import Quantity
+from pipeline.results.record_json import Finite, Number, Whole, read_record
 from pipeline.types import Array
 
 Verdict = Literal["agrees", "differs", "not possible"]
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """Value with its a-posteriori standard deviation."""
-
-    value: Number
-    sigma: Sigma
 
 
 @dataclass(frozen=True)
@@ -33,12 +26,12 @@ class ComparedParameter:
 
     name: str
     unit: str
-    reseau: Estimate
-    opencv: Estimate
+    reseau: Quantity
+    opencv: Quantity
     difference_sigmas: Number
 
     @classmethod
-    def from_numbers(cls, name: str, unit: str, reseau: Estimate, opencv: Estimate) -> "ComparedParameter":
+    def from_numbers(cls, name: str, unit: str, reseau: Quantity, opencv: Quantity) -> "ComparedParameter":
         apart = abs(reseau.value - opencv.value)
         return cls(name, unit, reseau, opencv, apart / reseau.sigma if reseau.sigma > 0 else 0.0)
 

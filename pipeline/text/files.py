@@ -19,8 +19,6 @@ _KINDS = {stat.S_ISFIFO: "a pipe", stat.S_ISCHR: "a device", stat.S_ISBLK: "a de
 LARGEST = 1e15  # limit of coordinates, sizes and standard deviations, any unit: squares of larger ones lose precision
 FilePath = str | os.PathLike[str]
 SMALLEST_SIGMA = 1e-9  # limit of standard deviations, mm, m or degrees: weights of smaller ones dominate all others
-
-
 FINEST_PITCH_UM = 0.1  # µm; no scanner or sensor has smaller pixels, so that mm or m must have been meant
 
 

@@ -24,10 +24,10 @@ from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanO
 from pipeline import read_adjustment, write_adjustment
 from pipeline.report import ReportData, Thumbnail
 from pipeline.results.adjustment_file import read_covariance
-from pipeline.results.adjustment_record import FilmRecord
+from pipeline.results.adjustment_record import FilmRecord, Quantity
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.measured_record import MeasuredScan
-from pipeline.results.stage_files import CameraCheck, Check, ComparedParameter, Estimate
+from pipeline.results.stage_files import CameraCheck, Check, ComparedParameter
 
 Array = NDArray[np.float64]
 
@@ -285,7 +285,7 @@ def _replace(result: Adjustment) -> ReportData:
         write_adjustment(result, path)
         stored, known = read_adjustment(path), read_covariance(path)
     rows = tuple(
-        ComparedParameter.from_numbers(name, unit, Estimate(value, sigma), Estimate(value + 0.1 * sigma, sigma))
+        ComparedParameter.from_numbers(name, unit, Quantity(value, sigma), Quantity(value + 0.1 * sigma, sigma))
         for name, unit, value, sigma in CHECKED
     )
     camera = CameraCheck("agrees", "All parameters agree within 0.1 sigma.", 5, 120, 4.61, 4.60, 0.012, rows)

@@ -14,6 +14,7 @@ from adjust.quality.run import Residuals
 from pipeline import InputError, read_adjustment, write_adjustment
 from pipeline.results import adjustment_content, stage_files
 from pipeline.results.adjustment_file import covariance_path, read_covariance
+from pipeline.results.adjustment_record import Quantity
 from pipeline.results.record_json import plain_json
 
 
@@ -205,9 +206,7 @@ def test_a_large_network_is_in_blocks(adjustment: Adjustment, path: Path, monkey
 def test_a_check_is_read_as_it_was_written_and_a_wrong_value_refused_with_its_place(tmp_path: Path) -> None:
     pixels = stage_files.PixelCalibration(1.0, 2.0, 3.0, 4.0, 0.5)
     corners = stage_files.CornersCheck("findChessboardCorners", 3, 12, ("a",), pixels, pixels)
-    row = stage_files.ComparedParameter.from_numbers(
-        "k1", "", stage_files.Estimate(1.0, 0.1), stage_files.Estimate(1.0, 0.1)
-    )
+    row = stage_files.ComparedParameter.from_numbers("k1", "", Quantity(1.0, 0.1), Quantity(1.0, 0.1))
     camera = stage_files.CameraCheck("agrees", "All agree.", 3, 12, 1.0, 1.1, 0.1, (row,), corners)
     path = tmp_path / "check.json"
 
