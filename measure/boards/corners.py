@@ -7,6 +7,9 @@ the point, both directions, the blur, and the grey values: contrast, offset, gra
 of the tone curve, which widens light squares at the expense of dark ones. A crossing is symmetric under a half turn for
 any tone curve, so its place does not depend on the curve. The place of a quarter does: it shifts with the edges.
 
+A lens bends the edges. Their curvature is taken from the other corners after the plain fit, and they are fitted as
+parabolas from then on. Junctions stay those of straight edges, whose noise is larger than this shifts them.
+
 The junction is determined in addition: the point closest to the edge lines, which run perpendicular to the grey-value
 gradients (Förstner and Gülch, 1987, A fast operator for detection and precise location of distinct points, corners and
 centres of circular features). A lens with coma blurs edges to one side; a crossing then has no unique place. Match and
@@ -24,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.array_types import Array, Indices, Integers, Mask, Single
+from measure.boards.edge_curvature import edge_curvatures
 from measure.flags import NO_REASON, Cause, Code, Reason
 from measure.matching.gauss_newton import UNDETERMINED, UNSETTLED
 from measure.matching.models import PIXEL_VARIANCE_PX2
@@ -163,11 +167,12 @@ class Corner:
 @dataclass(frozen=True, eq=False)
 class CornerStart:
     """Initial values of a corner. center_px (2,); steps_px (2, 2): columns along the two edges; reach_px (2,): half
-    size of the window along each edge."""
+    size of the window along each edge; board (2,): its place on the board, whose edges are parallel to its axes."""
 
     center_px: Array
     steps_px: Array
     reach_px: Array
+    board: Array
 
     @property
     def half_px(self) -> int:
@@ -215,6 +220,8 @@ class _CornerFits:
         turn = np.pi * np.stack([mirrored, ~mirrored], axis=1)
         self.edges = np.arctan2(steps[:, 1], steps[:, 0]) + np.pi / 2 + turn
         self.start_edges = self.edges.copy()
+        self.board = np.array([start.board for start in starts])
+        self.curvatures = np.zeros((len(starts), 2))  # 1/px, of the edges towards their normals
         self.max_shift_px = _MOST_SHIFT * self.reach.min(axis=1)
         self.variance = np.full(len(starts), _START_BLUR_PX**2)
         self.max_variance = (self.reach.min(axis=1) / 2) ** 2 + PIXEL_VARIANCE_PX2
@@ -255,6 +262,8 @@ class _CornerFits:
         self._linearise(np.arange(len(self.windows)), is_first=True)
         for stage, tolerance_px in enumerate(_STAGES_TOLERANCE_PX):
             moving = np.array([number for number, reason in enumerate(self.reasons) if not reason], np.intp)
+            if stage == 1:
+                self._bend_edges()
             if stage:
                 scale[moving] = self._residual_scales(moving)
             for _ in range(_MAX_ITERATIONS):
@@ -265,6 +274,12 @@ class _CornerFits:
                 moving = moving[(lengths_px >= tolerance_px) & [not self.reasons[number] for number in moving]]
             self._refuse(moving, UNSETTLED)
         return self._corners()
+
+    def _bend_edges(self) -> None:
+        """Take the curvature of the edges from the corners as they are fitted so far."""
+        fits = np.array([not reason for reason in self.reasons])
+        centers_px = np.where(fits[:, None], self.center + self.origin, np.nan)
+        self.curvatures = edge_curvatures(centers_px, self.board, self._normals(np.arange(len(fits))))
 
     def _refuse(self, numbers: Indices, reason: Reason) -> None:
         for number in numbers:
@@ -348,14 +363,21 @@ class _CornerFits:
         robust = [robust_scale(self.residuals[number, self.weights[number] > 0]) for number in numbers]
         return np.asarray(np.maximum(np.maximum(robust, floor), 1e-9))
 
+    def _normals(self, numbers: Indices) -> Array:
+        """(m, 2 edges, 2) unit normals of the edges."""
+        return np.stack([np.cos(self.edges[numbers]), np.sin(self.edges[numbers])], axis=-1)
+
     def _linearise(self, numbers: Indices, is_first: bool = False) -> None:
         """Compute derivatives and residuals of some corners. The first call estimates the grey values."""
         sigma = np.sqrt(self.variance[numbers, None])
-        normals = np.stack([np.cos(self.edges[numbers]), np.sin(self.edges[numbers])], axis=-1)  # (m, 2 edges, 2)
+        normals = self._normals(numbers)
         tangents = np.stack([-normals[..., 1], normals[..., 0]], axis=-1)
         offset = self.places[numbers] - self.center[numbers, :, None].astype(np.float32)
         directions = np.concatenate([normals, tangents], axis=1) / sigma[..., None]
         u, v, *along = np.moveaxis(directions.astype(np.float32) @ offset, 1, 0)
+        # Edges are parabolas, which a lens makes of lines. Their derivatives are those of the lines, to a hundredth.
+        bend = (self.curvatures[numbers] * sigma / 2).astype(np.float32)
+        u, v = u - bend[:, :1] * along[0] ** 2, v - bend[:, 1:] * along[1] ** 2
         correlation = (normals[:, 0] * normals[:, 1]).sum(axis=1).astype(np.float32)[:, None]
         value, by_u, by_v, by_correlation = self.surface(u, v, correlation)
         design = np.empty((len(numbers), self.unknowns, u.shape[1]), np.float32)

@@ -194,10 +194,10 @@ def _unless_alone(measured: BoardMeasurement, kind: str, others_px: Sequence[Arr
 def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) -> dict[str, Corner]:
     """Fit the detected corners by least-squares matching."""
     board_reach_px = _common_reach_px(found.values()) if found else 0.0
-    starts = [
-        CornerStart(each.center_px, each.steps_px, _reach_px(np.hypot(*each.steps_px), spec, board_reach_px))
-        for each in found.values()
-    ]
+    points, starts = spec.object_points(), list[CornerStart]()
+    for name, each in found.items():
+        reach_px = _reach_px(np.hypot(*each.steps_px), spec, board_reach_px)
+        starts.append(CornerStart(each.center_px, each.steps_px, reach_px, np.array(points[name][:2])))
 
     stands_alone = isinstance(spec, ArucoSpec | SquareGridSpec) and not isinstance(spec, AprilGridSpec)
 
@@ -211,7 +211,7 @@ def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) ->
     fitted = dict(zip(found, fit_corners(read, starts, surface, scan.rounding_step_dn), strict=True))
     if not stands_alone:
         return fitted
-    return without_edge_shift(fitted, found, spec.object_points(), (scan.width_px, scan.height_px))
+    return without_edge_shift(fitted, found, points, (scan.width_px, scan.height_px))
 
 
 def _reach_px(sides_px: Array, spec: BoardSpec, board_reach_px: float) -> Array:

@@ -155,6 +155,33 @@ def test_a_chessboard_of_another_count_is_refused_with_its_own(columns: int, row
     assert {mark.status for mark in board.marks} == {Status.ABSENT}
 
 
+@pytest.mark.parametrize("kind", ["chessboard", "aprilgrid"])
+def test_edges_that_a_lens_bends_move_no_corner(kind: str) -> None:
+    """Barrel distortion of 15 % at the outer corners: straight edges fitted to its parabolas lie up to 0.04 px off."""
+    is_chessboard = kind == "chessboard"
+    spec = CHESSBOARD if is_chessboard else APRIL_GRID
+    straight = draw.chessboard_dark(CHESSBOARD) if is_chessboard else draw.april_grid_dark(APRIL_GRID)
+    homography, flat = draw.board_from_pixel(5.0, 0.0), np.array([place[:2] for place in spec.object_points().values()])
+    middle = flat.mean(axis=0)
+    k1 = 0.15 / np.sum((flat - middle) ** 2, axis=1).max()
+
+    def dark(x: Array, y: Array) -> Any:
+        wider = 1 + k1 * ((x - middle[0]) ** 2 + (y - middle[1]) ** 2)
+        return straight(middle[0] + wider * (x - middle[0]), middle[1] + wider * (y - middle[1]))
+
+    bent = flat - middle
+    for _ in range(50):
+        bent = (flat - middle) / (1 + k1 * (bent**2).sum(axis=1, keepdims=True))
+    truth = dict(zip(spec.object_points(), draw.mapped(np.linalg.inv(homography), bent), strict=True))
+    board = measure_board(draw.make_scan(draw.take_picture(spec, homography, dark)), spec)
+    errors = draw.errors_px(board, truth)
+    assert len(errors) == len(flat)
+    away = list(truth.values()) - draw.mapped(np.linalg.inv(homography), np.zeros((1, 2)))
+    outward = np.sum(errors * away, axis=1) / np.hypot(*away.T)
+    assert abs(outward.mean()) < 0.004
+    assert np.sqrt(np.mean(errors**2)) < 0.012
+
+
 LARGE = specs.ChessboardSpec(9, 6, 24.0)
 
 
