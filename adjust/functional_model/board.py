@@ -87,27 +87,23 @@ def board_form(xyz: Array) -> BoardForm:
     _, extents, axes = np.linalg.svd(centred, full_matrices=False)
     if len(xyz) < 4 or extents[1] <= 1e-6 * extents[0] or extents[2] > LARGEST_RELIEF * extents[0]:
         raise ValueError("a board is at least four points about in a plane, not on a line")
+    from scipy.spatial import ConvexHull  # slow import: longer than the adjustment of most boards
+
     normal = axes[2] * np.sign(axes[2][np.abs(axes[2]).argmax()])
     upright = np.eye(3)[int(abs(normal[0]) > _UPRIGHT)]
     along = upright - normal * (upright @ normal)
     along /= np.linalg.norm(along)
     plane = np.stack([along, np.cross(normal, along)], axis=1)
-    axes = plane @ _to_sides(centred @ plane)
-    places = centred @ axes
-    low, high = places.min(axis=0), places.max(axis=0)
-    return BoardForm(normal, axes.T, (2.0 * places - low - high) / (high - low))
-
-
-def _to_sides(places: Array) -> Array:
-    """(2, 2) rotation by at most 45 degrees that aligns points (n, 2) with the smallest rectangle around them."""
-    # One side of that rectangle is an edge of the convex hull.
-    from scipy.spatial import ConvexHull  # slow import: longer than the adjustment of most boards
-
-    corners = places[ConvexHull(places).vertices]
+    # One side of the smallest rectangle is an edge of the convex hull: rotations by at most 45 degrees to the edges.
+    flat = centred @ plane
+    corners = flat[ConvexHull(flat).vertices]
     edges = np.roll(corners, -1, axis=0) - corners
     angles = np.arctan2(edges[:, 1], edges[:, 0])
     angles = (angles + np.pi / 4.0) % (np.pi / 2.0) - np.pi / 4.0
     turns = np.moveaxis(np.array([[np.cos(angles), -np.sin(angles)], [np.sin(angles), np.cos(angles)]]), -1, 0)
     areas = np.ptp(corners @ turns, axis=1).prod(axis=1)
     smallest = np.flatnonzero(areas < areas.min() * (1.0 + _EQUAL))
-    return np.asarray(turns[smallest[np.abs(angles[smallest]).argmin()]])
+    axes = plane @ turns[smallest[np.abs(angles[smallest]).argmin()]]
+    places = centred @ axes
+    low, high = places.min(axis=0), places.max(axis=0)
+    return BoardForm(normal, axes.T, (2.0 * places - low - high) / (high - low))

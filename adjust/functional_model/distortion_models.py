@@ -42,13 +42,6 @@ from adjust.functional_model.correction import (
 from adjust.linear_algebra.small_matrices import matrices
 
 TORLEGARD_NAMES = ("k3", "k5", "k7", "p1", "p2", "p3", "p4")
-BROWN_NAMES = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
-AICON_NAMES = ("a1", "a2", "a3", "b1", "b2", "c1", "c2")
-TORLEGARD_UNITS = ("mm⁻²", "mm⁻⁴", "mm⁻⁶", "mm⁻¹", "mm⁻¹", "mm⁻²", "mm⁻⁴")
-BROWN_UNITS = (*TORLEGARD_UNITS[:5], "–", "–")
-TORLEGARD_GROUPS = (("radial", TORLEGARD_NAMES[:3]), ("decentering", TORLEGARD_NAMES[3:5]))
-BROWN_GROUPS = (("radial", BROWN_NAMES[:3]), ("decentering", BROWN_NAMES[3:5]), ("affinity", BROWN_NAMES[5:]))
-AICON_GROUPS = (("radial", AICON_NAMES[:3]), ("decentering", AICON_NAMES[3:5]), ("affinity", AICON_NAMES[5:]))
 MM_PER_DM = 100.0
 UM_PER_MM = 1000.0
 TANGENTIAL_POWER = 1.85  # the tangential deformation grows with r to this power
@@ -105,11 +98,6 @@ def _terms(r0_mm: float, decenterings: int = 1, shift_mm: tuple[float, float] = 
     pairs = [term for power in range(decenterings) for term in decentering(power, x, y)]
     affinity = AFFINITY_TERMS if decenterings == 1 else ()
     return PolynomialTerms.from_terms([*(radial(power, r0_mm) for power in (1, 2, 3)), *pairs, *affinity])
-
-
-JUHL_NAMES = ("t1", "t2", "t3", "t4", "r1", "r2", "r3", "af", "sh")
-JUHL_UNITS = ("µm at 1 dm",) * len(JUHL_NAMES)
-JUHL_GROUPS = (("tangential", JUHL_NAMES[:4]), ("radial", JUHL_NAMES[4:7]), ("affinity", JUHL_NAMES[7:]))
 
 
 def juhl(settings: Settings, xy: Array, _: Array, parameters: Array) -> Correction:

@@ -48,8 +48,8 @@ class Family:
 
 
 def _polynomials(terms: distortion_models.PolynomialSet) -> Family:
-    groups = distortion_models.degree_groups(terms)
-    return Family(terms.names, correct=partial(distortion_models.correct, terms), needs="half_mm", groups=groups)
+    correct, groups = partial(distortion_models.correct, terms), distortion_models.degree_groups(terms)
+    return Family(terms.names, correct=correct, needs="half_mm", groups=groups)
 
 
 def _fourier(order: int) -> Family:
@@ -57,38 +57,45 @@ def _fourier(order: int) -> Family:
     return Family(names, correct=partial(distortion_models.fourier, order), needs="half_mm", groups=groups)
 
 
-_BROWN_LADDER = ("k1", "k1 k2", "k1 p1 p2", "k1 k2 p1 p2", "k1 k2 k3 p1 p2")
+_UNITS = ("mm⁻²", "mm⁻⁴", "mm⁻⁶", "mm⁻¹", "mm⁻¹")  # of three radial and two decentering terms
 _BROWN = Family(
-    distortion_models.BROWN_NAMES,
+    ("k1", "k2", "k3", "p1", "p2", "b1", "b2"),
     correct=distortion_models.brown,
-    units=distortion_models.BROWN_UNITS,
-    groups=distortion_models.BROWN_GROUPS,
-    ladder=_BROWN_LADDER,
+    units=(*_UNITS, "–", "–"),
+    groups=(("radial", ("k1", "k2", "k3")), ("decentering", ("p1", "p2")), ("affinity", ("b1", "b2"))),
+    ladder=("k1", "k1 k2", "k1 p1 p2", "k1 k2 p1 p2", "k1 k2 k3 p1 p2"),
 )
 _FAMILIES = {
     "none": Family(),
     "torlegard": Family(
         distortion_models.TORLEGARD_NAMES,
         correct=distortion_models.torlegard,
-        units=distortion_models.TORLEGARD_UNITS,
-        groups=distortion_models.TORLEGARD_GROUPS,
+        units=(*_UNITS, "mm⁻²", "mm⁻⁴"),
+        groups=(("radial", ("k3", "k5", "k7")), ("decentering", ("p1", "p2"))),
         ladder=("k3", "k3 k5", "k3 p1 p2", "k3 k5 p1 p2", "k3 k5 k7 p1 p2"),
     ),
     "brown": _BROWN,
     "australis": replace(_BROWN, correct=distortion_models.australis),
     "aicon": Family(
-        distortion_models.AICON_NAMES,
+        ("a1", "a2", "a3", "b1", "b2", "c1", "c2"),
         image=ideal_point_family(distortion_models.aicon),
-        units=distortion_models.BROWN_UNITS,
-        groups=distortion_models.AICON_GROUPS,
+        units=(*_UNITS, "–", "–"),
+        groups=(("radial", ("a1", "a2", "a3")), ("decentering", ("b1", "b2")), ("affinity", ("c1", "c2"))),
         ladder=("a1", "a1 a2", "a1 b1 b2", "a1 a2 b1 b2", "a1 a2 a3 b1 b2"),
     ),
     "opencv": Family(
         opencv_family.OPENCV_NAMES,
         image=ray_family(opencv_family.opencv),
-        units=opencv_family.OPENCV_UNITS,
-        y_down=opencv_family.OPENCV_Y_DOWN,
-        groups=opencv_family.OPENCV_GROUPS,
+        units=(*["–"] * 12, "rad", "rad", "–", "–"),
+        y_down=("p1", "s3", "s4", "tau_x", "b2"),
+        groups=(
+            ("radial", ("k1", "k2", "k3", "k4", "k5", "k6")),
+            ("radial, denominator", opencv_family.OPENCV_DENOMINATOR),
+            ("decentering", ("p1", "p2")),
+            ("thin prism", ("s1", "s2", "s3", "s4")),
+            ("tilt", ("tau_x", "tau_y")),
+            ("affinity", ("b1", "b2")),
+        ),
         ladder=("k1", "k1 k2", "k1 p1 p2", "k1 k2 p1 p2", "k1 k2 p1 p2 k3"),
         alike_at_zero=opencv_family.OPENCV_DENOMINATOR,
         apart=opencv_family.expanded,
@@ -98,16 +105,16 @@ _FAMILIES = {
         image=ray_family(opencv_family.opencv_fisheye),
         units=("–",) * len(opencv_family.FISHEYE_NAMES),
         y_down=("b2",),
-        groups=opencv_family.FISHEYE_GROUPS,
+        groups=(("radial", ("k1", "k2", "k3", "k4")), ("affinity", ("b1", "b2"))),
         ladder=("k1", "k1 k2", "k1 k2 k3", "k1 k2 k3 k4"),
         is_pinhole_at_zero=False,
     ),
     "juhl": Family(
-        distortion_models.JUHL_NAMES,
+        ("t1", "t2", "t3", "t4", "r1", "r2", "r3", "af", "sh"),
         correct=distortion_models.juhl,
-        units=distortion_models.JUHL_UNITS,
+        units=("µm at 1 dm",) * 9,
         needs="r0_mm",
-        groups=distortion_models.JUHL_GROUPS,
+        groups=(("tangential", ("t1", "t2", "t3", "t4")), ("radial", ("r1", "r2", "r3")), ("affinity", ("af", "sh"))),
     ),
     "ebner": _polynomials(distortion_models.EBNER),
     "gruen": _polynomials(distortion_models.GRUEN),

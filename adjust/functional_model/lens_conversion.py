@@ -70,7 +70,10 @@ def convert_lens(
     rays = _Rays.from_lens(source, corners_mm)
     if estimated is not None:
         return rays.fit(into, tuple(estimated), held)
-    usual, with_affinity = _usual(into.family)
+    target = family(into.family)
+    usual = tuple(target.ladder[-1].split()) if target.ladder else target.parameters
+    affinity = dict(target.groups).get("affinity", ())
+    with_affinity = tuple(each for each in target.parameters if each in usual or each in affinity)
     found = rays.fit(into, usual)
     if not found.is_same and with_affinity != usual:
         richer = rays.fit(into, with_affinity)
@@ -84,14 +87,6 @@ def frame_grid_mm(corners_mm: Array) -> Array:
     along = np.linspace(0.0, 1.0, _GRID)
     fractions = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
     return np.asarray(corners_mm[0] + fractions * (corners_mm[1] - corners_mm[0]))
-
-
-def _usual(name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Usual parameters of a family, and the same with affinity and shear."""
-    own_family = family(name)
-    usual = tuple(own_family.ladder[-1].split()) if own_family.ladder else own_family.parameters
-    affinity = dict(own_family.groups).get("affinity", ())
-    return usual, tuple(each for each in own_family.parameters if each in usual or each in affinity)
 
 
 @dataclass(frozen=True)

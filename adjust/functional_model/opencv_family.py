@@ -12,18 +12,7 @@ from adjust.linear_algebra.small_matrices import applied, matrices, product, vec
 
 OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y", "b1", "b2")
 OPENCV_DENOMINATOR = ("k4", "k5", "k6")  # at 0 their derivatives are those of k1, k2, k3 with opposite sign
-OPENCV_GROUPS = (
-    ("radial", ("k1", "k2", "k3", "k4", "k5", "k6")),
-    ("radial, denominator", OPENCV_DENOMINATOR),
-    ("decentering", ("p1", "p2")),
-    ("thin prism", ("s1", "s2", "s3", "s4")),
-    ("tilt", ("tau_x", "tau_y")),
-    ("affinity", ("b1", "b2")),
-)
-OPENCV_Y_DOWN = ("p1", "s3", "s4", "tau_x", "b2")  # would change sign with y up
-OPENCV_UNITS = (*["–"] * 12, "rad", "rad", "–", "–")
 FISHEYE_NAMES = ("k1", "k2", "k3", "k4", "b1", "b2")
-FISHEYE_GROUPS = (("radial", FISHEYE_NAMES[:4]), ("affinity", FISHEYE_NAMES[4:]))
 DOWN = np.array([1.0, -1.0])  # from axes with y up to OpenCV's, and back
 CENTRAL = 1e-4  # tangent below which an angle is expanded in a series: the next term is below 1e-16
 

@@ -63,14 +63,26 @@ class SightVectors:
 
 def sight_vectors(setting: LineOfSight, station: Array, xyz: Array) -> SightVectors:
     """Compute the vectors from stations (3,) or (n, 3) to the apparent places of points (n, 3)."""
-    stations = np.broadcast_to(station, xyz.shape)
-    apparent = _over_the_sphere(setting.unit_m, stations, xyz) if setting.curvature else _straight(stations, xyz)
-    return _refracted(setting.unit_m, stations, xyz, apparent) if setting.refraction else apparent
-
-
-def _straight(stations: Array, xyz: Array) -> SightVectors:
-    shape = (*xyz.shape, 3)
-    return SightVectors(xyz - stations, np.broadcast_to(-np.eye(3), shape), np.broadcast_to(np.eye(3), shape))
+    stations, unit_m = np.broadcast_to(station, xyz.shape), setting.unit_m
+    straight = SightVectors(
+        xyz - stations, *(np.broadcast_to(side * np.eye(3), (*xyz.shape, 3)) for side in (-1.0, 1.0))
+    )
+    apparent = _over_the_sphere(unit_m, stations, xyz) if setting.curvature else straight
+    if not setting.refraction:
+        return apparent
+    # Raise the points by the refraction coefficient times the square of their distance.
+    per_m, by_station_height, by_point_height = bending(unit_m * stations[:, 2], unit_m * xyz[:, 2])
+    coefficient = unit_m * per_m
+    square = (apparent.vector**2).sum(axis=1)
+    vector, by_station, by_point = apparent.vector.copy(), apparent.by_station.copy(), apparent.by_point.copy()
+    vector[:, 2] += coefficient * square
+    for derivative, by_height, of_vector in (
+        (by_station, by_station_height, apparent.by_station),
+        (by_point, by_point_height, apparent.by_point),
+    ):
+        derivative[:, 2] += 2.0 * coefficient[:, None] * np.einsum("ni,nij->nj", apparent.vector, of_vector)
+        derivative[:, 2, 2] += unit_m**2 * by_height * square
+    return SightVectors(vector, by_station, by_point)
 
 
 def _over_the_sphere(unit_m: float, stations: Array, xyz: Array) -> SightVectors:
@@ -78,7 +90,10 @@ def _over_the_sphere(unit_m: float, stations: Array, xyz: Array) -> SightVectors
     radius = EARTH_RADIUS_M / unit_m
     plan = xyz[:, :2] - stations[:, :2]
     height, angle = xyz[:, 2], np.sqrt((plan**2).sum(axis=1)) / radius
-    stretch, sinc, bent = 1.0 + height / radius, np.sinc(angle / np.pi), _sinc_slope(angle)
+    stretch, sinc, small = 1.0 + height / radius, np.sinc(angle / np.pi), angle < SMALL_RAD
+    a = np.where(small, 1.0, angle)
+    # Derivative of sin(a) / a, divided by a.
+    bent = np.where(small, -1.0 / 3.0 + angle**2 / 30.0, (np.cos(a) - np.sinc(a / np.pi)) / a**2)
     ahead = (stretch * sinc)[:, None] * plan
     drop = -2.0 * (radius + height) * np.sin(angle / 2.0) ** 2  # no difference of large numbers
     vector = np.column_stack([ahead, drop + height - stations[:, 2]])
@@ -91,29 +106,6 @@ def _over_the_sphere(unit_m: float, stations: Array, xyz: Array) -> SightVectors
     by_station = np.zeros_like(by_point)
     by_station[:, :, :2] = -by_point[:, :, :2]
     by_station[:, 2, 2] = -1.0
-    return SightVectors(vector, by_station, by_point)
-
-
-def _sinc_slope(angle: Array) -> Array:
-    """Derivative of sin(a) / a, divided by a."""
-    small = angle < SMALL_RAD
-    a = np.where(small, 1.0, angle)
-    return np.where(small, -1.0 / 3.0 + angle**2 / 30.0, (np.cos(a) - np.sinc(a / np.pi)) / a**2)
-
-
-def _refracted(unit_m: float, stations: Array, xyz: Array, apparent: SightVectors) -> SightVectors:
-    """Raise the points by the refraction coefficient times the square of their distance."""
-    per_m, by_station_height, by_point_height = bending(unit_m * stations[:, 2], unit_m * xyz[:, 2])
-    coefficient = unit_m * per_m
-    square = (apparent.vector**2).sum(axis=1)
-    vector, by_station, by_point = apparent.vector.copy(), apparent.by_station.copy(), apparent.by_point.copy()
-    vector[:, 2] += coefficient * square
-    for derivative, by_height, of_vector in (
-        (by_station, by_station_height, apparent.by_station),
-        (by_point, by_point_height, apparent.by_point),
-    ):
-        derivative[:, 2] += 2.0 * coefficient[:, None] * np.einsum("ni,nij->nj", apparent.vector, of_vector)
-        derivative[:, 2, 2] += unit_m**2 * by_height * square
     return SightVectors(vector, by_station, by_point)
 
 

@@ -45,17 +45,20 @@ TOLERANCE_MM = 1e-11
 def smooth_terms(films: Iterable[str]) -> tuple[str, ...]:
     """List the combined terms and those of degree 2 and 3 that none of the film transformations absorbs."""
     products = [(axis, degree - n, n) for degree in SMOOTH for axis in (0, 1) for n in range(degree + 1)]
-    return _remaining_terms(films, (*COMBINED, *(_name(*each) for each in products)))
+    return _remaining_terms(films, products, COMBINED)
 
 
 def carriage_terms(films: Iterable[str]) -> tuple[str, ...]:
     """List the terms of degree 4 to 6 along x or y alone that none of the film transformations absorbs."""
     products = [(axis, *pair) for degree in ALONG for pair in ((degree, 0), (0, degree)) for axis in (0, 1)]
-    return _remaining_terms(films, tuple(_name(*each) for each in products))
+    return _remaining_terms(films, products)
 
 
-def _remaining_terms(films: Iterable[str], names: Iterable[str]) -> tuple[str, ...]:
+def _remaining_terms(
+    films: Iterable[str], products: Iterable[tuple[int, int, int]], combined: Iterable[str] = ()
+) -> tuple[str, ...]:
     kinds = set(films) - {"none"}
+    names = (*combined, *(f"{'ab'[axis]}{m}{n}" for axis, m, n in products))
     return tuple(name for name in names if all(is_left(kind, name) for kind in kinds))
 
 
@@ -73,10 +76,6 @@ def is_left(kind: str, name: str) -> bool:
     if kind == "bilinear":
         return (m, n) != (1, 1)
     return m + n > polynomial_order(kind)
-
-
-def _name(axis: int, m: int, n: int) -> str:
-    return f"{'ab'[axis]}{m}{n}"
 
 
 def _product(name: str) -> tuple[int, int, int]:
@@ -111,19 +110,22 @@ class Bend:
 
     def displacement(self, parameters: Array, scan_mm: Array) -> Correction:
         """Compute the displacements (n, 2) by the scanner at scan coordinates (n, 2), mm, with their derivatives."""
+        straight_mm = scan_mm
+        if self.lens is not None:
+            ideal_mm, found = self.lens.ideal_from_observed(scan_mm)
+            straight_mm = np.where(found[:, None], ideal_mm, np.nan)  # nan where the lens folds over
+        bend = no_correction(Distortion(), straight_mm, np.zeros(2), parameters)
+        if self.terms:
+            half, center = np.array(self.half_mm), np.array(self.center_mm)
+            bend = summed(self._polynomial_set, half, straight_mm, center, parameters)
         if self.lens is None:
-            return self._bend_displacement(parameters, scan_mm)
-        straight_mm, by_scan = _remove_distortion(self.lens, scan_mm)
-        bend = self._bend_displacement(parameters, straight_mm)
+            return bend
+        # The derivatives follow from the lens's condition equations by the implicit function theorem.
+        at = self.lens.equations(scan_mm, (ideal_mm - self.lens.interior[1:]) / self.lens.interior[0])
+        by_scan = self.lens.interior[0] * np.linalg.solve(-at.ray_jacobian, at.xy_jacobian)
         gradient = product(np.eye(2) - bend.xy_jacobian, by_scan)
         value = scan_mm - straight_mm + bend.value
         return replace(bend, value=value, xy_jacobian=np.eye(2) - gradient)
-
-    def _bend_displacement(self, parameters: Array, straight_mm: Array) -> Correction:
-        """Displacements by the scanner terms alone, at coordinates (n, 2) free of lens distortion."""
-        if not self.terms:
-            return no_correction(Distortion(), straight_mm, np.zeros(2), parameters)
-        return summed(self._polynomial_set, np.array(self.half_mm), straight_mm, np.array(self.center_mm), parameters)
 
     def apply(self, parameters: Array, scan_mm: Array) -> Array:
         """Correct scan coordinates (n, 2) for the scanner, mm."""
@@ -151,16 +153,6 @@ class Bend:
         terms: dict[str, Term] = {name: COMBINED.get(name) or _product(name) for name in self.terms}
         degrees = [2 if isinstance(term, str) else max(term[1:]) for term in terms.values()]
         return legendre_terms(terms, max(degrees))
-
-
-def _remove_distortion(lens: Lens, scan_mm: Array) -> tuple[Array, Array]:
-    """Distortion-free image points (n, 2), and their derivatives (n, 2, 2) with respect to the observed ones."""
-    # The derivatives follow from the lens's condition equations by the implicit function theorem. Points are nan where
-    # the lens folds over.
-    straight_mm, found = lens.ideal_from_observed(scan_mm)
-    at = lens.equations(scan_mm, (straight_mm - lens.interior[1:]) / lens.interior[0])
-    by_scan = lens.interior[0] * np.linalg.solve(-at.ray_jacobian, at.xy_jacobian)
-    return np.where(found[:, None], straight_mm, np.nan), by_scan
 
 
 NO_BEND = Bend()

@@ -23,7 +23,7 @@ from math import comb
 
 import numpy as np
 
-from adjust.array_types import Array, Indices, Mask
+from adjust.array_types import Array, Mask
 from adjust.linear_algebra.small_matrices import NEWTON_STEPS, applied, determinant, solved
 
 NEWTON_TOLERANCE = 1e-9  # fraction of a coordinate: the remaining error is the square of the last step
@@ -63,9 +63,9 @@ class FilmKind(ABC):
         """Derivatives (..., k, k) of the parameters with respect to the centred parameters."""
 
     @property
-    def is_linear(self) -> bool:
-        """Whether the formula is linear in the coordinates."""
-        return False
+    def degree(self) -> int:
+        """Degree in the coordinates, of a fraction of its numerator and denominator."""
+        return 1
 
     def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
         """Compute comparator coordinates (n, 2) from camera coordinates, and the mask of those found.
@@ -76,7 +76,7 @@ class FilmKind(ABC):
         iteration converges and the determinant of the derivatives has the sign that it has at the centre, so that the
         formula does not fold over.
         """
-        steps = 1 if self.is_linear else NEWTON_STEPS
+        steps = 1 if self.degree == 1 else NEWTON_STEPS
         xy = np.broadcast_to(center, camera_xy.shape).astype(np.float64)
         at_center = self.gradient(parameters, xy)
         turn = np.sign(determinant(at_center))
@@ -87,7 +87,7 @@ class FilmKind(ABC):
                 step, regular = _solved(gradient, self.apply(parameters, xy) - camera_xy)
                 xy = xy - step
                 settled = np.abs(step).max(axis=-1) <= NEWTON_TOLERANCE * (1.0 + np.abs(xy).max(axis=-1))
-                found = regular & (settled | self.is_linear)
+                found = regular & (settled | (self.degree == 1))
                 if found.all():
                     break
             same_side = np.sign(determinant(self.gradient(parameters, xy))) == turn
@@ -132,10 +132,6 @@ class Polynomial(FilmKind):
     exponents: tuple[tuple[int, int], ...]
     mixing: Array
 
-    @property
-    def is_linear(self) -> bool:
-        return self._degree == 1
-
     def apply(self, parameters: Array, xy: Array) -> Array:
         return self._combination(parameters, self._terms(xy))
 
@@ -161,13 +157,13 @@ class Polynomial(FilmKind):
         return np.asarray((self.mixing / (self.mixing**2).sum(axis=0)).T @ result @ self.mixing)
 
     @cached_property
-    def _degree(self) -> int:
+    def degree(self) -> int:
         return max(p + q for p, q in self.exponents)
 
     def _terms(self, xy: Array, by: int | None = None) -> Array:
         """Monomials (..., terms), or their derivatives with respect to x (0) or y (1)."""
         powers = [np.ones_like(xy)]
-        for _ in range(self._degree):
+        for _ in range(self.degree):
             powers.append(powers[-1] * xy)
         terms = []
         for exponents in self.exponents:
@@ -210,10 +206,6 @@ class Congruent(FilmKind):
 
     mirrored: bool
     names: tuple[str, ...] = ("a1", "b1", "angle")
-
-    @property
-    def is_linear(self) -> bool:
-        return True
 
     def apply(self, parameters: Array, xy: Array) -> Array:
         return parameters[..., :2] + applied(self._turn(parameters), xy)
@@ -438,24 +430,19 @@ def fit_transformation(transformation: str, comparator_mm: Array, camera_mm: Arr
     """
     if transformation == "none":
         return np.zeros(0), False
-    mirrored = _is_mirrored(comparator_mm, camera_mm)
+    mirrored = False
+    if len(comparator_mm) >= 3:
+        kinds = [film_kind("similarity", is_mirrored) for is_mirrored in (False, True)]
+        squared = _squared(kinds[0], _fit(kinds[0], comparator_mm, camera_mm), comparator_mm, camera_mm)
+        if not _agree(squared):
+            costs = [_robust_fit(each, comparator_mm, camera_mm)[1] for each in kinds]
+            mirrored = costs[1] < PLAINLY * costs[0]
     kind = film_kind(transformation, mirrored)
     if marks_needed(transformation) > len(comparator_mm) and (lower := simpler(transformation)):
         parameters, _ = fit_transformation(lower, comparator_mm, camera_mm)
         lattice = comparator_mm.mean(axis=0) + _half(comparator_mm) * LATTICE
         return _fit(kind, lattice, film_kind(lower, mirrored).apply(parameters, lattice)), mirrored
     return _robust_fit(kind, comparator_mm, camera_mm)[0], mirrored
-
-
-def _is_mirrored(comparator_mm: Array, camera_mm: Array) -> bool:
-    """Decide whether a scan is mirrored: quickly if all marks agree, else by robust fits, upright and mirrored."""
-    if len(comparator_mm) < 3:
-        return False
-    kinds = [film_kind("similarity", mirrored) for mirrored in (False, True)]
-    if _agree(_squared(kinds[0], _fit(kinds[0], comparator_mm, camera_mm), comparator_mm, camera_mm)):
-        return False
-    upright, mirrored = (_robust_fit(kind, comparator_mm, camera_mm)[1] for kind in kinds)
-    return mirrored < PLAINLY * upright
 
 
 def _robust_fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> tuple[Array, float]:
@@ -467,7 +454,11 @@ def _robust_fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> tuple
     best_cost = float(np.sort(squared)[:half].sum())
     if half == n or _agree(squared):
         return best, best_cost
-    kept = _subsets(n, fewest)
+    if comb(n, fewest) <= MOST_SUBSETS:
+        kept = np.array(list(combinations(range(n), fewest)))
+    else:
+        generator = np.random.default_rng(0)
+        kept = np.array([generator.permutation(n)[:fewest] for _ in range(MOST_SUBSETS)])
     for _ in range(3):
         candidates = _fit(kind, comparator_mm[kept], camera_mm[kept])
         squared = _squared(kind, candidates[:, None], comparator_mm, camera_mm)
@@ -485,14 +476,6 @@ def _agree(squared: Array) -> bool:
     return bool((squared < GROSS * LEAST_VARIANCE_MM2).all())
 
 
-def _subsets(n: int, size: int) -> Indices:
-    """(subsets, size): all subsets of n marks, or MOST_SUBSETS random ones if there are more."""
-    if comb(n, size) <= MOST_SUBSETS:
-        return np.array(list(combinations(range(n), size)))
-    generator = np.random.default_rng(0)
-    return np.array([generator.permutation(n)[:size] for _ in range(MOST_SUBSETS)])
-
-
 def _squared(kind: FilmKind, parameters: Array, comparator_mm: Array, camera_mm: Array) -> Array:
     with np.errstate(all="ignore"):  # a subset of poor geometry may map other marks to infinity
         squared = ((kind.apply(parameters, comparator_mm) - camera_mm) ** 2).sum(axis=-1)
@@ -503,18 +486,22 @@ def _fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> Array:
     """Least-squares parameters (..., u) of centred marks (..., n, 2); of minimum norm where they are rank-deficient."""
     center, half = comparator_mm.mean(axis=-2, keepdims=True), _half(comparator_mm)
     target = camera_mm.mean(axis=-2, keepdims=True)
-    moved, count = camera_mm - target, len(kind.names)
+    xy, moved = comparator_mm - center, camera_mm - target
     match kind:
         case Identity():
             return np.zeros((*half.shape, 0))
         case Congruent():
-            return _congruent(kind, comparator_mm - center, moved, center[..., 0, :], target[..., 0, :])
+            m = -1.0 if kind.mirrored else 1.0
+            (x, y), (u, v) = np.moveaxis(xy, -1, 0), np.moveaxis(moved, -1, 0)
+            turn = np.zeros((*half.shape, 3))
+            turn[..., 2] = np.arctan2((x * v - m * y * u).sum(axis=-1), (x * u + m * y * v).sum(axis=-1))
+            turn[..., :2] = target[..., 0, :] - kind.apply(turn, center[..., 0, :])
+            return turn
         case Projective():
-            return _projective((comparator_mm - center) / half[..., None, None], moved, center, half, target)
-    nothing = np.zeros(count)
+            return _projective(xy / half[..., None, None], moved, center, half, target)
+    nothing = np.zeros(len(kind.names))
     design = kind.design(nothing, comparator_mm, center, half[..., None])
-    centred = _least_squares(design, moved)
-    parameters = applied(kind.centred_jacobian(nothing, center[..., 0, :], half), centred)
+    parameters = applied(kind.centred_jacobian(nothing, center[..., 0, :], half), _least_squares(design, moved))
     parameters[..., [kind.names.index("a1"), kind.names.index("b1")]] += target[..., 0, :]
     return parameters
 
@@ -531,15 +518,6 @@ def _half(xy_mm: Array) -> Array:
     """(...) half the longer side of the bounding box of marks (..., n, 2); 1 where it is 0."""
     half = np.ptp(xy_mm, axis=-2).max(axis=-1) / 2.0
     return np.where(half > 0.0, half, 1.0)
-
-
-def _congruent(kind: Congruent, xy: Array, moved: Array, center: Array, target: Array) -> Array:
-    m = -1.0 if kind.mirrored else 1.0
-    (x, y), (u, v) = np.moveaxis(xy, -1, 0), np.moveaxis(moved, -1, 0)
-    turn = np.zeros((*center.shape[:-1], 3))
-    turn[..., 2] = np.arctan2((x * v - m * y * u).sum(axis=-1), (x * u + m * y * v).sum(axis=-1))
-    turn[..., :2] = target - kind.apply(turn, center)
-    return turn
 
 
 def _projective(xy: Array, moved: Array, center: Array, half: Array, target: Array) -> Array:

@@ -9,6 +9,7 @@ scanned at once; that of each part follows from it.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
+from operator import itemgetter
 
 import numpy as np
 
@@ -29,7 +30,7 @@ from adjust.initial_values.pose import KnownField, Pose, Sight, image_distances
 from adjust.initial_values.resection import FEWEST, find_principal_distance, find_wide_distance, resect_images
 from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Exterior, Image, Network
-from adjust.problem.observations import Distance, Observations
+from adjust.problem.observations import Observations
 from adjust.problem.unknowns import Reduction
 from adjust.validation import validate
 
@@ -120,7 +121,7 @@ def initial_values(network: Network) -> Approximations:
 
 
 def _initial_values(network: Network) -> Approximations:
-    if network.has_parts:
+    if any(image.part_of for image in network.images):
         return _joined_values(network)
     films = _film_transformations(network)
     transformation, mirrored = _film_parameters(films)
@@ -130,9 +131,16 @@ def _initial_values(network: Network) -> Approximations:
     interior = {camera.name: _interior(camera, frames, resected) for camera in used}
     sights = {name: sight for camera in used for name, sight in _sights(camera, frames, interior[camera.name]).items()}
     poses, points = orient(network, sights, resected)
+    images = [image for image in network.images if image.name in poses]
+    rotations = np.array([poses[image.name].rotation for image in images]).reshape(-1, 3, 3)
+    nearby = angles_from_rotation(rotations)
+    for angles, image in zip(nearby, images, strict=True):
+        if image.exterior is not None:  # of equivalent angles those nearest to the given ones
+            angles[:] = image.exterior.values[3:]
+    own_angles = zip(images, angles_near(rotations, nearby), strict=True)
     return Approximations(
         interior=interior,
-        exterior=_exteriors([image for image in network.images if image.name in poses], poses),
+        exterior={image.name: np.concatenate([poses[image.name].center, angles]) for image, angles in own_angles},
         transformation=transformation,
         points=points,
         mirrored=mirrored,
@@ -269,19 +277,6 @@ def _sights(camera: Camera, frames: Frames, interior: Array) -> dict[str, Sight]
     return frames.sights(camera.name, lens)
 
 
-def _exteriors(images: Sequence[Image], poses: Mapping[str, Pose]) -> dict[str, Array]:
-    """X0, Y0, Z0, omega, phi, kappa (6,) by image; of equivalent angles those nearest to the given ones."""
-    rotations = np.array([poses[image.name].rotation for image in images]).reshape(-1, 3, 3)
-    nearby = angles_from_rotation(rotations)
-    for angles, image in zip(nearby, images, strict=True):
-        if image.exterior is not None:
-            angles[:] = image.exterior.values[3:]
-    angles = angles_near(rotations, nearby)
-    return {
-        image.name: np.concatenate([poses[image.name].center, own]) for image, own in zip(images, angles, strict=True)
-    }
-
-
 def orient(
     network: Network, sights: Mapping[str, Sight], resected: Mapping[str, Pose]
 ) -> tuple[dict[str, Pose], dict[str, Array]]:
@@ -305,8 +300,15 @@ def orient(
     if sights and not block.poses:
         block.poses.update(orient_free_model(sights, block.firm))
         extend(block)
-        if all(np.isnan(xyz).all() for xyz in block.rough.values()):
-            _scale_by_distances(block, network.distances)
+        if all(np.isnan(xyz).all() for xyz in block.rough.values()):  # the base of the model is arbitrary
+            places = {image: pose.center for image, pose in block.poses.items()} | block.points
+            measured = [each for each in network.distances if each.start in places and each.end in places]
+            if measured:
+                lengths = [np.linalg.norm(places[each.end] - places[each.start]) for each in measured]
+                ratios = [each.value / length for each, length in zip(measured, lengths, strict=True)]
+                scale = float(np.median(ratios))
+                block.poses = {image: Pose(pose.rotation, scale * pose.center) for image, pose in block.poses.items()}
+                block.points = {point: scale * xyz for point, xyz in block.points.items()}
     missing = sorted(name for name in sights if name not in block.poses)
     if missing:
         raise UnorientedError({name: _why_not_oriented(block, name) for name in missing})
@@ -326,20 +328,6 @@ def _given_or_resected(exterior: Exterior, block: Block, image: str) -> Pose:
     return found if left_given > CLEARLY_WORSE * max(left_found, block.sights[image].sigma_mm) else given
 
 
-def _scale_by_distances(block: Block, distances: Sequence[Distance]) -> None:
-    """Scale a model of arbitrary base by the median ratio of the measured distances to those in the model."""
-    places = {image: pose.center for image, pose in block.poses.items()} | block.points
-    ratios = [
-        each.value / np.linalg.norm(places[each.end] - places[each.start])
-        for each in distances
-        if each.start in places and each.end in places
-    ]
-    if ratios:
-        scale = float(np.median(ratios))
-        block.poses = {image: Pose(pose.rotation, scale * pose.center) for image, pose in block.poses.items()}
-        block.points = {point: scale * xyz for point, xyz in block.points.items()}
-
-
 def _all_points(block: Block) -> dict[str, Array]:
     """Coordinates of every point: known, else intersected, else the given approximation.
 
@@ -351,8 +339,16 @@ def _all_points(block: Block) -> dict[str, Array]:
     found = {name: xyz for name, xyz in points.items() if name not in unknown}
     for name in sorted(unknown):
         showing = [image for image in sorted(block.sights) if name in block.sights[image].points]
-        if len(showing) == 1 or (showing and len(unknown) > MOST_UNMET * len(points)):
-            raise AdjustmentError(_why_not_intersected(name, showing))
+        if len(showing) == 1:
+            raise AdjustmentError(
+                f"point {name} is unknown and measured in image {showing[0]} only; two images are needed to find it. "
+                "Measure it in another image, give its coordinates, or leave it out."
+            )
+        if showing and len(unknown) > MOST_UNMET * len(points):
+            raise AdjustmentError(
+                f"point {name} is unknown, and its rays from images {', '.join(showing)} do not meet in front of the "
+                "cameras. Check its number in these images, or give approximate coordinates."
+            )
         if showing:
             sight, pose = block.sights[showing[0]], block.poses[showing[0]]
             ray = sight.rays[sight.points.index(name)] @ pose.rotation
@@ -360,18 +356,6 @@ def _all_points(block: Block) -> dict[str, Array]:
             away = float(np.median(np.linalg.norm(met - pose.center, axis=1))) if len(met) else 1.0
             found[name] = pose.center + away * ray / np.linalg.norm(ray)
     return found
-
-
-def _why_not_intersected(point: str, images: Sequence[str]) -> str:
-    if len(images) == 1:
-        return (
-            f"point {point} is unknown and measured in image {images[0]} only; two images are needed to find it. "
-            "Measure it in another image, give its coordinates, or leave it out."
-        )
-    return (
-        f"point {point} is unknown, and its rays from images {', '.join(images)} do not meet in front of the cameras. "
-        "Check its number in these images, or give approximate coordinates."
-    )
 
 
 def _why_not_oriented(block: Block, image: str) -> str:
@@ -409,23 +393,18 @@ def camera_frames(network: Network, transformation: Mapping[str, Array], mirrore
     rows = rows[np.lexsort((rank[number[rows]], network.image_numbers[rows]))]
     images = network.image_numbers[rows]
     starts = np.searchsorted(images, np.arange(count + 1))
-    variances = np.trace(observations.covariance_mm2[rows], axis1=1, axis2=2) / 2.0
     xy_mm = network.straight_xy_mm[rows]
     for i, image in enumerate(network.images):
         if image.transformation != "none":
             part, kind = slice(starts[i], starts[i + 1]), film_kind(image.transformation, image.name in mirrored)
             xy_mm[part] = kind.apply(transformation[image.name], xy_mm[part])
-    return Frames(network, rows, xy_mm, starts, np.sqrt(_medians(variances, images, starts)))
-
-
-def _medians(values: Array, group: Indices, starts: Indices) -> Array:
-    """Medians (g,) of values (n,) by group, the groups one after the other; 0 for an empty group."""
-    if not len(values):
-        return np.zeros(len(starts) - 1)
-    ordered = values[np.lexsort((values, group))]
-    counts = np.diff(starts)
-    middle = np.minimum([starts[:-1] + (counts - 1) // 2, starts[:-1] + counts // 2], len(values) - 1)
-    return np.asarray(np.where(counts > 0, ordered[middle].mean(axis=0), 0.0))
+    variances = np.zeros(count)
+    if len(rows):  # medians by image
+        ordered = np.trace(observations.covariance_mm2[rows], axis1=1, axis2=2) / 2.0
+        ordered, counts = ordered[np.lexsort((ordered, images))], np.diff(starts)
+        middle = np.minimum([starts[:-1] + (counts - 1) // 2, starts[:-1] + counts // 2], len(rows) - 1)
+        variances = np.where(counts > 0, ordered[middle].mean(axis=0), 0.0)
+    return Frames(network, rows, xy_mm, starts, np.sqrt(variances))
 
 
 def joined_frame(network: Network, parts: Sequence[Image]) -> tuple[dict[str, FilmFit], dict[str, Array]]:
@@ -433,7 +412,11 @@ def joined_frame(network: Network, parts: Sequence[Image]) -> tuple[dict[str, Fi
 
     Raises AdjustmentError if the parts have too few points in common, or the frame has too few fiducial marks.
     """
-    marks_by_part = {part.name: _marks(network, part) for part in parts}
+    observations, marks_by_part = network.observations, dict[str, dict[Mark, Array]]()
+    for part in parts:
+        rows = np.flatnonzero(network.image_numbers == network.images.index(part))
+        by_mark = {(observations.kind[row], observations.point[row]): network.straight_xy_mm[row] for row in rows}
+        marks_by_part[part.name] = dict(sorted(by_mark.items(), key=itemgetter(0)))
     first_from, place = _placed(parts[0].part_of, marks_by_part)
     given = network.camera_by_name[parts[0].camera].fiducials
     marks = sorted(point for kind, point in place if kind == "fiducial")
@@ -452,16 +435,6 @@ def joined_frame(network: Network, parts: Sequence[Image]) -> tuple[dict[str, Fi
     joins = [(point, xy) for (what, point), xy in place.items() if what == "join"]
     in_camera = whole.apply(parameters, np.array([xy for _, xy in joins]).reshape(-1, 2))
     return films, {point: xy for (point, _), xy in zip(joins, in_camera, strict=True)}
-
-
-def _marks(network: Network, part: Image) -> dict[Mark, Array]:
-    """Comparator coordinates of all marks of a part, sorted by kind and name."""
-    rows = np.flatnonzero(network.image_numbers == network.images.index(part))
-    observations = network.observations
-    return {
-        (observations.kind[row], observations.point[row]): network.straight_xy_mm[row]
-        for row in sorted(rows, key=lambda row: (observations.kind[row], observations.point[row]))
-    }
 
 
 def _placed(

@@ -82,22 +82,18 @@ def linear_transformations(xyz: Array, xy_mm: Array, present: Mask | None = None
         own = is_flat == flat
         axes = field.axes[own, :, :2] if flat else np.eye(3)
         at = np.concatenate([field.places[own] @ axes, present[own, :, None]], axis=2)
-        found = _least_eigenvectors(at, image.places[own])
+        x, y = image.places[own][..., :1], image.places[own][..., 1:]
+        count, _, width = at.shape
+        normal = np.zeros((count, 3, width, 3, width))
+        across = at.swapaxes(1, 2)
+        normal[:, 0, :, 0] = normal[:, 1, :, 1] = across @ at
+        for axis, by in enumerate((x, y)):
+            normal[:, axis, :, 2] = normal[:, 2, :, axis] = -(across @ (by * at))
+        normal[:, 2, :, 2] = across @ ((x**2 + y**2) * at)
+        found = np.linalg.eigh(normal.reshape(count, 3 * width, -1))[1][:, :, 0].reshape(count, 3, width)
         coefficients[own] = np.concatenate([found[..., :-1] @ np.swapaxes(axes, -1, -2), found[..., -1:]], axis=2)
     coefficients *= np.where(coefficients[:, 2:, 3:] < 0.0, -1.0, 1.0)  # the depth of the centroid
     return LinearTransformations(field, image, present, is_flat, coefficients)
-
-
-def _least_eigenvectors(at: Array, to: Array) -> Array:
-    """Coefficients (m, 3, k) of transformations of homogeneous coordinates (m, n, k) to image coordinates (m, n, 2)."""
-    (count, _, width), (x, y) = at.shape, (to[..., :1], to[..., 1:])
-    normal = np.zeros((count, 3, width, 3, width))
-    across = at.swapaxes(1, 2)
-    normal[:, 0, :, 0] = normal[:, 1, :, 1] = across @ at
-    for axis, by in enumerate((x, y)):
-        normal[:, axis, :, 2] = normal[:, 2, :, axis] = -(across @ (by * at))
-    normal[:, 2, :, 2] = across @ ((x**2 + y**2) * at)
-    return np.linalg.eigh(normal.reshape(count, 3 * width, -1))[1][:, :, 0].reshape(count, 3, width)
 
 
 def closed_form(given: LinearTransformations) -> tuple[float, Array, Array] | None:

@@ -99,7 +99,13 @@ def find_mismatches(problem: Problem) -> Mismatches:
         usual = np.maximum(usual, _largest(_usual_misses(missed, problem.image_numbers[rows]), of_point))
     for number in np.flatnonzero(largest > APART * usual):
         own = rows[of_point == number]
-        met = _intersections(problem, rays, own)
+        # Intersections of pairs of the point's rays, and its start; known coordinates are kept.
+        at = problem.places[own[0]]
+        known = np.where(np.isfinite(unknowns.sigma[at]), unknowns.given[at], np.nan)
+        pairs = np.array(list(islice(combinations(own.tolist(), 2), MOST_PAIRS)), dtype=np.intp).reshape(-1, 2)
+        both, of_pair = pairs.ravel(), np.repeat(np.arange(len(pairs)), 2)
+        met, _ = intersect(rays.centers[both], rays.directions[both], of_pair, np.tile(known, (len(pairs), 1)))
+        met = np.concatenate([unknowns.start[at][None], met[~np.isnan(met).any(axis=1)]])
         meets = (missed := rays.misses_mm(own, met[:, None])) <= APART * usual[number]
         best = int(np.lexsort((np.where(meets, missed, 0.0).sum(axis=1), -meets.sum(axis=1)))[0])
         name = problem.network.observations.point[own[0]]
@@ -126,13 +132,3 @@ def _usual_misses(missed: Array, images: Indices) -> Array:
     starts, counts = np.unique(images[order], return_index=True, return_counts=True)[1:]
     usual = np.where(counts > 1, missed[order][starts + (USUAL * (counts - 1)).astype(np.intp)], 0.0)
     return np.asarray(usual[np.searchsorted(images[order][starts], images)])
-
-
-def _intersections(problem: Problem, rays: Rays, rows: Indices) -> Array:
-    """Intersections (k, 3) of pairs of a point's rays, and its start; known coordinates are kept."""
-    at = problem.places[rows[0]]
-    known = np.where(np.isfinite(problem.unknowns.sigma[at]), problem.unknowns.given[at], np.nan)
-    pairs = np.array(list(islice(combinations(rows.tolist(), 2), MOST_PAIRS)), dtype=np.intp).reshape(-1, 2)
-    both, of_pair = pairs.ravel(), np.repeat(np.arange(len(pairs)), 2)
-    met, _ = intersect(rays.centers[both], rays.directions[both], of_pair, np.tile(known, (len(pairs), 1)))
-    return np.concatenate([problem.unknowns.start[at][None], met[~np.isnan(met).any(axis=1)]])

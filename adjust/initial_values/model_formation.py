@@ -120,18 +120,15 @@ def _pose(essential: Array, first: Array, second: Array) -> Pose:
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     rotations = [u @ w @ vt * np.sign(np.linalg.det(u @ vt)) for w in (turn, turn.T)]
     poses = [Pose(rotation, sign * rotation.T @ u[:, 2]) for rotation in rotations for sign in (1.0, -1.0)]
-    return max(poses, key=lambda pose: _pairs_in_front(pose, first, second))
-
-
-def _pairs_in_front(pose: Pose, first: Array, second: Array) -> int:
-    """Number of pairs of rays that intersect at positive distances from both cameras."""
-    turned = second @ pose.rotation
-    cosine = (first * turned).sum(axis=1)
-    along_first, along_second = first @ pose.center, turned @ pose.center
-    # least squares of s first - t turned = center, times the positive determinant 1 - cosine²
-    s = along_first - cosine * along_second
-    t = cosine * along_first - along_second
-    return int(((s > 0) & (t > 0)).sum())
+    in_front = []
+    for pose in poses:
+        # Least squares of s first - t turned = center, times the positive determinant 1 - cosine².
+        turned = second @ pose.rotation
+        cosine = (first * turned).sum(axis=1)
+        along_first, along_second = first @ pose.center, turned @ pose.center
+        s, t = along_first - cosine * along_second, cosine * along_first - along_second
+        in_front.append(int(((s > 0) & (t > 0)).sum()))
+    return poses[int(np.argmax(in_front))]
 
 
 def _angle(pose: Pose, other: Pose) -> float:
@@ -179,8 +176,10 @@ def absolute_orientation(model: Array, known: Array, stations: Array) -> Similar
         return None
     target = _centred(known, given)
     if (given.all(axis=1) == given.any(axis=1)).all():
-        rotation = _closed_rotation(_centred(model, given), target)
-        return None if rotation is None else _similarity(rotation, model, known, given)
+        u, strength, vt = np.linalg.svd(target.T @ _centred(model, given))
+        proper = np.array([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)])
+        is_determined = proper[1:] @ strength[1:] > SINGULAR**2 * strength[0]  # False for points on a line
+        return _similarity((u * proper) @ vt, model, known, given) if is_determined else None
     starts = Rotation.from_quat(np.random.default_rng(0).normal(size=(STARTS, 4))).as_matrix()  # uniform over SO(3)
     costs = np.array([(_misfit(start, model, target, given) ** 2).sum() for start in starts])
     found: list[tuple[float, bool, Array]] = []
@@ -246,14 +245,6 @@ def _centred(xyz: Array, given: Mask) -> Array:
     """Coordinates reduced by the mean of the given ones, axis by axis; 0 where not given."""
     mean = np.where(given, xyz, 0.0).sum(axis=0) / given.sum(axis=0)
     return np.where(given, xyz - mean, 0.0)
-
-
-def _closed_rotation(model: Array, target: Array) -> Array | None:
-    """Rotation (3, 3) from centred points of the model to the same in the object; None where these lie on a line."""
-    u, strength, vt = np.linalg.svd(target.T @ model)
-    proper = np.array([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)])
-    is_determined = proper[1:] @ strength[1:] > SINGULAR**2 * strength[0]
-    return (u * proper) @ vt if is_determined else None
 
 
 def _misfit(rotation: Array, model: Array, target: Array, given: Mask) -> Array:
@@ -359,7 +350,7 @@ def orient_free_model(sights: Mapping[str, Sight], known: Mapping[str, Array]) -
     absolutely, by heights alone if nothing else is known. Without any known coordinate it keeps the axes of its first
     image and a base of 1.
     """
-    models = [model for first, second in _pairs(sights) for model in _models(sights, first, second)]
+    models = _models(sights)
     if not models:
         return {}
     best = min(models, key=lambda model: (-len(model.poses), typical_residual(model)))
@@ -382,31 +373,26 @@ def orient_free_model(sights: Mapping[str, Sight], known: Mapping[str, Array]) -
     }
 
 
-def _pairs(sights: Mapping[str, Sight]) -> list[tuple[str, str]]:
-    """Pairs of images with most common points."""
-    shared = {
-        pair: len(set(sights[pair[0]].points) & set(sights[pair[1]].points)) for pair in combinations(sorted(sights), 2)
+def _models(sights: Mapping[str, Sight]) -> list[Block]:
+    """Models of the pairs of images with most common points, one for each relative orientation, extended by all images
+    that can be joined."""
+    common = {
+        pair: sorted(set(sights[pair[0]].points) & set(sights[pair[1]].points))
+        for pair in combinations(sorted(sights), 2)
     }
-    enough = [pair for pair, count in shared.items() if count >= FEWEST_SHARED]
-    return sorted(enough, key=lambda pair: (-shared[pair], pair))[:PAIRS]
-
-
-def _models(sights: Mapping[str, Sight], first: str, second: str) -> list[Block]:
-    """Models of a pair, one for each relative orientation, extended by all images that can be joined."""
-    common = sorted(set(sights[first].points) & set(sights[second].points))
-    rays = [_rays(sights[image], common) for image in (first, second)]
+    enough = [pair for pair, points in common.items() if len(points) >= FEWEST_SHARED]
     nothing = {name: np.full(3, np.nan) for sight in sights.values() for name in sight.points}
     models = []
-    for pose in relative_poses(rays[0], rays[1], np.random.default_rng(0)):
-        model = Block(sights, nothing, nothing, {first: Pose(np.eye(3), np.zeros(3)), second: pose})
-        extend(model)
-        models.append(model)
+    for first, second in sorted(enough, key=lambda pair: (-len(common[pair]), pair))[:PAIRS]:
+        rays = []
+        for sight in (sights[first], sights[second]):
+            row = {name: i for i, name in enumerate(sight.points)}
+            rays.append(sight.rays[[row[name] for name in common[first, second]]])
+        for pose in relative_poses(rays[0], rays[1], np.random.default_rng(0)):
+            model = Block(sights, nothing, nothing, {first: Pose(np.eye(3), np.zeros(3)), second: pose})
+            extend(model)
+            models.append(model)
     return models
-
-
-def _rays(sight: Sight, points: list[str]) -> Array:
-    rows = {name: row for row, name in enumerate(sight.points)}
-    return sight.rays[[rows[name] for name in points]]
 
 
 def typical_residual(model: Block) -> float:

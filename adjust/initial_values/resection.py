@@ -163,15 +163,20 @@ def trial_misfits(fields: Sequence[KnownField], principal_distances_mm: Array) -
 
     Each is the geometric mean over the images of the robust variance of a coordinate, for the best pose from a few
     triples: the likelihood where each image has its own variance, so that misidentified points of one image do not
-    decide.
+    decide. The points are thinned out evenly.
     """
-    c = np.repeat(principal_distances_mm, len(fields))
+    steps = [-(-len(each.xyz) // COARSE_POINTS) for each in fields]
+    thin = [
+        KnownField(each.xyz[::step], each.xy_mm[::step], each.sigma_mm)
+        for each, step in zip(fields, steps, strict=True)
+    ]
+    c = np.repeat(principal_distances_mm, len(thin))
     variances = c**2  # of images without a pose
-    for some, batch, rotations, shifts, image in _best_poses(len(principal_distances_mm) * list(fields), c, TRIAL):
+    for some, batch, rotations, shifts, image in _best_poses(len(principal_distances_mm) * thin, c, TRIAL):
         sigma = _robust_sigmas(batch.squared(rotations, shifts, image), batch.counts[image])
         variances[some[image]] = (sigma * batch.c[image]) ** 2
-    floor = np.array([field.sigma_mm for field in fields]) ** 2
-    return np.asarray(np.exp(np.log(variances.reshape(-1, len(fields)) + floor).mean(axis=1)))
+    floor = np.array([field.sigma_mm for field in thin]) ** 2
+    return np.asarray(np.exp(np.log(variances.reshape(-1, len(thin)) + floor).mean(axis=1)))
 
 
 def three_point_poses(xyz: Array, xy_mm: Array, principal_distance_mm: float) -> list[Pose]:
@@ -324,21 +329,22 @@ class _Fields:
         sigma = np.maximum(_robust_sigmas(squared, self.counts[image]), self.floor[image])
         return sigma, squared < REJECTION * sigma[:, None] ** 2
 
-    def triples(self, most: int) -> Indices:
-        """Triples of points (k, m, 3): all, or random ones without slender triangles, which give poor poses."""
-        counts = self.counts
+    def candidates(self, effort: Effort) -> tuple[Array, Array, Indices]:
+        """Best P3P poses: rotations (c, 3, 3), shifts (c, 3), and the image (c,) of each, image by image.
+
+        From all triples of points, or random ones without slender triangles, which give poor poses.
+        """
+        counts, most = self.counts, effort.triples
         if comb(int(counts.max()), 3) <= MAX_TRIPLES:
             every = np.array(list(combinations(range(int(counts[0])), 3)), dtype=np.intp)
-            return np.broadcast_to(every, (len(counts), *every.shape))
-        drawn = (np.random.default_rng(0).random((4 * most, 3)) * counts[:, None, None]).astype(np.intp)
-        a, b, c = np.moveaxis(self.tangents[np.arange(len(counts))[:, None, None], drawn], 2, 0)
-        area = np.abs((b - a)[..., 0] * (c - a)[..., 1] - (b - a)[..., 1] * (c - a)[..., 0])
-        slender = (area == 0.0) | (area < 0.5 * np.median(area, axis=1, keepdims=True))
-        return np.take_along_axis(drawn, np.argsort(slender, axis=1, kind="stable")[:, :most, None], axis=1)
-
-    def candidates(self, effort: Effort) -> tuple[Array, Array, Indices]:
-        """Best P3P poses: rotations (c, 3, 3), shifts (c, 3), and the image (c,) of each, image by image."""
-        triples = self.triples(effort.triples)
+            triples = np.broadcast_to(every, (len(counts), *every.shape))
+        else:
+            drawn = (np.random.default_rng(0).random((4 * most, 3)) * counts[:, None, None]).astype(np.intp)
+            a, b, c = np.moveaxis(self.tangents[np.arange(len(counts))[:, None, None], drawn], 2, 0)
+            area = np.abs((b - a)[..., 0] * (c - a)[..., 1] - (b - a)[..., 1] * (c - a)[..., 0])
+            slender = (area == 0.0) | (area < 0.5 * np.median(area, axis=1, keepdims=True))
+            best = np.argsort(slender, axis=1, kind="stable")[:, :most, None]
+            triples = np.take_along_axis(drawn, best, axis=1)
         image = np.repeat(np.arange(len(triples)), triples.shape[1])
         at = image[:, None], triples.reshape(-1, 3)
         rotations, shifts, of = triple_poses(self.points[at], self.tangents[at])
@@ -353,23 +359,20 @@ class _Fields:
         return order[np.arange(len(order)) - np.searchsorted(image[order], image[order]) < most]
 
 
-def _batches(fields: Sequence[KnownField]) -> Iterator[Indices]:
-    """Batches of images with similar numbers of points; with equal ones where all triples are used."""
+def _best_poses(
+    fields: Sequence[KnownField], c: Array, effort: Effort
+) -> Iterator[tuple[Indices, "_Fields", Array, Array, Indices]]:
+    """Yield batches of fields with the best pose of each: numbers of the fields, batch, rotations, shifts, image.
+
+    The images of a batch have similar numbers of points; equal ones where all triples are used.
+    """
     counts = np.array([len(field.xyz) for field in fields], dtype=np.intp)
     order = np.argsort(-counts, kind="stable")
     while len(order):
         largest = int(counts[order[0]])
         fewest = largest if comb(largest, 3) <= MAX_TRIPLES else max(largest // 2, 11)
         alike = int((counts[order[: max(1, POINTS_AT_ONCE // largest)]] >= fewest).sum())
-        yield order[:alike]
-        order = order[alike:]
-
-
-def _best_poses(
-    fields: Sequence[KnownField], c: Array, effort: Effort
-) -> Iterator[tuple[Indices, "_Fields", Array, Array, Indices]]:
-    """Yield batches of fields with the best pose of each: numbers of the fields, batch, rotations, shifts, image."""
-    for some in _batches(fields):
+        some, order = order[:alike], order[alike:]
         batch = _Fields.from_fields([fields[i] for i in some], c[some])
         sample = batch.sample(effort.points)
         rotations, shifts, image = sample.candidates(effort)
@@ -433,7 +436,7 @@ def find_principal_distance(fields: Sequence[KnownField]) -> tuple[float | None,
     if (directly := distance_directly(fields)) is not None:
         return directly[0], {field: each.pose for field, each in zip(fields, directly[2], strict=True)}
     tried = GRID * _radius_mm(fields)
-    misfits = trial_misfits([_thin_field(each) for each in fields[:COARSE_IMAGES]], tried)
+    misfits = trial_misfits(fields[:COARSE_IMAGES], tried)
     c, sigma = float(tried[int(np.argmin(misfits))]), np.inf
     found = resections(fields, [c] * len(fields))
     for _ in range(2):
@@ -460,22 +463,28 @@ def find_wide_distance(fields: Sequence[KnownField], distortion: Distortion) -> 
         return None
     radius_mm = _radius_mm(fields)
 
-    def misfit(angle_deg: float) -> float:
-        lens = Lens(distortion, np.array([radius_mm / np.radians(angle_deg), 0.0, 0.0]), distortion.values)
-        return _misfit_mm2(fields, lens)
+    def misfit_mm2(angle_deg: float) -> float:
+        """Sum over the images of the median squared residual; inf if an image has no pose."""
+        c, total = radius_mm / np.radians(angle_deg), 0.0
+        lens = Lens(distortion, np.array([c, 0.0, 0.0]), distortion.values)
+        ideal_mm, found = zip(*(lens.ideal_from_observed(each.xy_mm) for each in fields), strict=True)
+        if not all(each.all() for each in found):
+            return np.inf
+        ideal = [KnownField(each.xyz, xy, each.sigma_mm) for each, xy in zip(fields, ideal_mm, strict=True)]
+        for field, resection in zip(fields, resections(ideal, len(fields) * [float(c)]), strict=True):
+            if resection is None:
+                return np.inf
+            ray, _ = rays(resection.pose.rotation, field.xyz - resection.pose.center)
+            imaged_mm, imaged = lens.camera_from_ray(ray)
+            total += float(np.median(np.where(imaged, ((imaged_mm - field.xy_mm) ** 2).sum(axis=1), np.inf)))
+        return total
 
-    left = [misfit(angle) for angle in ANGLES_DEG]
+    left = [misfit_mm2(angle) for angle in ANGLES_DEG]
     best, step, least = float(ANGLES_DEG[int(np.argmin(left))]), float(ANGLES_DEG[0] - ANGLES_DEG[1]), min(left)
     for _ in range(HALVES):
         step /= 2.0
-        least, best = min((least, best), *((misfit(angle), angle) for angle in (best - step, best + step)))
+        least, best = min((least, best), *((misfit_mm2(angle), angle) for angle in (best - step, best + step)))
     return radius_mm / float(np.radians(best)) if np.isfinite(least) else None
-
-
-def _thin_field(field: KnownField) -> KnownField:
-    """Thin out the points of an image evenly, for the coarse search."""
-    step = -(-len(field.xyz) // COARSE_POINTS)
-    return KnownField(field.xyz[::step], field.xy_mm[::step], field.sigma_mm)
 
 
 def _largest_fields(fields: Sequence[KnownField], fewest: int, most: int) -> list[KnownField]:
@@ -486,19 +495,3 @@ def _largest_fields(fields: Sequence[KnownField], fewest: int, most: int) -> lis
 def _radius_mm(fields: Sequence[KnownField]) -> float:
     x, y = np.concatenate([each.xy_mm for each in fields]).T
     return float(np.hypot(x, y).max())
-
-
-def _misfit_mm2(fields: Sequence[KnownField], lens: Lens) -> float:
-    """Sum over the images of the median squared residual, mm²; inf if an image has no pose."""
-    ideal_mm, found = zip(*(lens.ideal_from_observed(each.xy_mm) for each in fields), strict=True)
-    if not all(each.all() for each in found):
-        return np.inf
-    ideal = [KnownField(each.xyz, xy, each.sigma_mm) for each, xy in zip(fields, ideal_mm, strict=True)]
-    total = 0.0
-    for field, resection in zip(fields, resections(ideal, len(fields) * [float(lens.interior[0])]), strict=True):
-        if resection is None:
-            return np.inf
-        ray, _ = rays(resection.pose.rotation, field.xyz - resection.pose.center)
-        imaged_mm, imaged = lens.camera_from_ray(ray)
-        total += float(np.median(np.where(imaged, ((imaged_mm - field.xy_mm) ** 2).sum(axis=1), np.inf)))
-    return total

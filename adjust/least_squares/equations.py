@@ -11,13 +11,12 @@ import numpy as np
 from scipy.sparse import csr_array
 
 import compiled
-from adjust.array_types import Array, Indices, Mask
+from adjust.array_types import Array, Indices
 from adjust.linear_algebra.factor import Blocks
 from adjust.linear_algebra.fronts import Fronts, band_order, make_fronts
 from adjust.linear_algebra.small_matrices import applied, inverse, lower_root, product
 from adjust.linear_algebra.sparse_rows import Pattern, SparseRows
 from adjust.problem.condition_equations import Derivatives
-from adjust.problem.further_observations import FurtherObservation
 from adjust.problem.problem import ABSENT, Problem, State, side_by_side
 
 ELEMENTS_AT_ONCE = 2_000_000  # matrix elements of the blocks in one batch
@@ -53,12 +52,12 @@ class Numbering:
     def free(self) -> Indices:
         """Positions of the free unknowns, the shared ones in elimination order."""
         free = np.flatnonzero(self.problem.unknowns.sigma > 0.0)
-        return np.concatenate([self._shared_order.positions, free[np.isin(free, self._blocks.owned)]])
+        return np.concatenate([self._shared_order[0], free[np.isin(free, self._blocks.owned)]])
 
     @property
     def fronts(self) -> Fronts:
         """Fronts of the shared unknowns."""
-        return self._shared_order.fronts
+        return self._shared_order[1]
 
     @cached_property
     def touched(self) -> list[Touched]:
@@ -91,14 +90,15 @@ class Numbering:
         place_of[self._point_unknowns[:, :1]] = np.arange(len(of_points))[:, None]
         images = image_columns, of_images, problem.image_numbers
         points = place_columns, of_points, place_of[np.where(problem.is_fiducial, ABSENT, problem.places[:, 0])]
-        if not self._points_own and (unknowns.join or len(self._frame_unknowns) < len(of_images)):
+        points_own, shared_count = self._blocks.are_points, len(self._shared_order[0])
+        if not points_own and (unknowns.join or len(self._frame_unknowns) < len(of_images)):
             return None
-        owning, grouped = (points, images) if self._points_own else (images, points)
+        owning, grouped = (points, images) if points_own else (images, points)
         own, members = (
             np.pad(self.numbers[of], ((0, 1), (0, 0)), constant_values=ABSENT) for _, of, _ in (owning, grouped)
         )
-        own[own < self._shared_count] = ABSENT
-        members[members >= self._shared_count] = ABSENT
+        own[own < shared_count] = ABSENT
+        members[members >= shared_count] = ABSENT
         block = np.where((own[owning[2]] >= 0).any(axis=1), owning[2], len(own) - 1)
         group = np.where((members[grouped[2]] >= 0).any(axis=1), grouped[2], len(members) - 1)
         if not (members >= 0).any() or not (own[block] >= 0).any():
@@ -114,77 +114,69 @@ class Numbering:
                 single[column] = numbers
         used, rest = np.array(list(single), dtype=np.intp), np.array(list(single.values()), dtype=np.intp)
         columns = owning[0], grouped[0], used
-        return Pattern(columns, block, group, own, members, rest.reshape(-1, len(block)).T, self._shared_count)
-
-    @property
-    def _shared_count(self) -> int:
-        return len(self._shared_order.positions)
+        return Pattern(columns, block, group, own, members, rest.reshape(-1, len(block)).T, shared_count)
 
     @cached_property
-    def _shared_order(self) -> "_Shared":
-        """Shared unknowns in elimination order: neighbouring images (or points) in sequence, the remaining ones last.
+    def _shared_order(self) -> tuple[Indices, Fronts]:
+        """Positions (s,) of the shared unknowns in elimination order, and their fronts.
 
-        In their original order if they form a single front.
+        Neighbouring images (or points) are in sequence, the remaining unknowns last. In their original order if they
+        form a single front.
         """
         free = np.flatnonzero(self.problem.unknowns.sigma > 0.0)
         shared = free[~np.isin(free, self._blocks.owned)]
-        group = self._group[shared]
-        sizes = np.bincount(group[group >= 0], minlength=len(self._grouped))
+        # Frames or points are groups: those of the kind that blocks do not own. The last element stands for ABSENT.
+        grouped = self._frame_unknowns if self._blocks.are_points else self._point_unknowns
+        group_of = np.full(len(self.problem.unknowns) + 1, ABSENT, dtype=np.intp)
+        group_of[grouped] = np.arange(len(grouped))[:, None]
+        group_of[ABSENT] = ABSENT
+        group = group_of[shared]
+        sizes = np.bincount(group[group >= 0], minlength=len(grouped))
         present = np.flatnonzero(sizes)
         if not len(present):
-            return _Shared(shared, Fronts.single(len(shared)))
-        met = self._group_meetings[:, present]
+            return shared, Fronts.single(len(shared))
+        met = self._group_meetings(group_of, len(grouped))[:, present]
         meeting = csr_array(met.T @ met)
         order = band_order(meeting)
         fronts = make_fronts(meeting[order][:, order], sizes[present[order]], int((group < 0).sum()))
         if len(fronts) == 1:
-            return _Shared(shared, fronts)
+            return shared, fronts
         rank = np.full(len(sizes) + 1, len(sizes), dtype=np.intp)  # the last stands for what is in no group
         rank[present[order]] = np.arange(len(order))
-        return _Shared(shared[np.argsort(rank[group], kind="stable")], fronts)
+        return shared[np.argsort(rank[group], kind="stable")], fronts
 
-    @property
-    def _grouped(self) -> Indices:
-        """Positions (g, k) of the unknowns of each frame, or of each point: of the kind that blocks do not own."""
-        return self._frame_unknowns if self._points_own else self._point_unknowns
-
-    @cached_property
-    def _group(self) -> Indices:
-        """Group (frame or point) of each unknown by position; ABSENT for others, and as the last element."""
-        group = np.full(len(self.problem.unknowns) + 1, ABSENT, dtype=np.intp)
-        group[self._grouped] = np.arange(len(self._grouped))[:, None]
-        group[ABSENT] = ABSENT
-        return group
-
-    @property
-    def _group_meetings(self) -> csr_array:
+    def _group_meetings(self, group_of: Indices, count: int) -> csr_array:
         """Incidence matrix (b, g) of blocks and groups; further observations follow the blocks as more rows."""
-        groups = [self._frame_of_rows if self._points_own else self._group[self.problem.places[:, 0]]]
+        # group_of: group of each unknown by position, ABSENT for none.
+        groups = [self._frame_of_rows if self._blocks.are_points else group_of[self.problem.places[:, 0]]]
         blocks = [self._blocks.of]
         for i, further in enumerate(self.problem.further):
-            groups.append(self._group[further.positions])
+            groups.append(group_of[further.positions])
             blocks.append(np.full(len(further.positions), len(self._blocks.owned) + i))
         group, block = np.concatenate(groups), np.concatenate(blocks)
         some = group >= 0
-        shape = len(self._blocks.owned) + len(self.problem.further), len(self._grouped)
+        shape = len(self._blocks.owned) + len(self.problem.further), count
         return csr_array((np.ones(int(some.sum())), (block[some], group[some])), shape=shape)
 
-    @property
+    @cached_property
     def _blocks(self) -> "_Blocks":
-        return self._point_blocks if self._points_own else self._frame_blocks
-
-    @cached_property
-    def _points_own(self) -> bool:
-        free = np.append(self.problem.unknowns.sigma > 0.0, False)  # the last stands for ABSENT
-        return bool(free[self._point_blocks.owned].sum() > free[self._frame_blocks.owned].sum())
-
-    @cached_property
-    def _is_tied(self) -> Mask:
-        """Mask by position of the unknowns in further observations; the last element stands for ABSENT."""
-        tied = np.zeros(len(self.problem.unknowns) + 1, dtype=bool)
-        for further in self.problem.further:
+        """Blocks of the frames, or of the points where these own more free unknowns."""
+        problem, unknowns = self.problem, self.problem.unknowns
+        tied = np.zeros(len(unknowns) + 1, dtype=bool)  # in further observations; the last stands for ABSENT
+        for further in problem.further:
             tied[further.positions] = True
-        return tied
+        of_frames, points = self._frame_unknowns.copy(), self._point_unknowns
+        of_frames[tied[of_frames].any(axis=1)] = ABSENT
+        points = points[(unknowns.sigma[points] > 0.0).any(axis=1) & ~tied[points].any(axis=1)]
+        free = np.append(unknowns.sigma > 0.0, False)  # the last stands for ABSENT
+        if free[points].sum() <= free[of_frames].sum():
+            return _Blocks(of_frames, self._frame_of_rows, are_points=False)
+        of_point = np.full(len(unknowns) + 1, len(points), dtype=np.intp)  # the last stands for ABSENT
+        of_point[points[:, 0]] = np.arange(len(points))
+        block = of_point[np.where(problem.is_fiducial, ABSENT, problem.places[:, 0])]
+        nothing = np.full((len(of_frames), 3), ABSENT, dtype=np.intp)  # owned by the frames' other observations
+        block = block + np.where(block == len(points), self._frame_of_rows, 0)
+        return _Blocks(np.concatenate([points, nothing]), block, are_points=True)
 
     @cached_property
     def _frame_unknowns(self) -> Indices:
@@ -207,32 +199,6 @@ class Numbering:
         """Positions (points, 3) of the unknowns of each point."""
         return np.array(list(self.problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
 
-    @cached_property
-    def _frame_blocks(self) -> "_Blocks":
-        owned = self._frame_unknowns.copy()
-        owned[self._is_tied[owned].any(axis=1)] = ABSENT
-        return _Blocks(owned, self._frame_of_rows)
-
-    @cached_property
-    def _point_blocks(self) -> "_Blocks":
-        problem, unknowns = self.problem, self.problem.unknowns
-        points = self._point_unknowns
-        points = points[(unknowns.sigma[points] > 0.0).any(axis=1) & ~self._is_tied[points].any(axis=1)]
-        of_point = np.full(len(unknowns) + 1, len(points), dtype=np.intp)  # the last stands for ABSENT
-        of_point[points[:, 0]] = np.arange(len(points))
-        block = of_point[np.where(problem.is_fiducial, ABSENT, problem.places[:, 0])]
-        nothing = np.full((len(self._frame_unknowns), 3), ABSENT, dtype=np.intp)
-        others = block == len(points)
-        return _Blocks(np.concatenate([points, nothing]), block + np.where(others, self._frame_of_rows, 0))
-
-
-@dataclass(frozen=True)
-class _Shared:
-    """Positions (s,) of the shared unknowns in elimination order, and their fronts."""
-
-    positions: Indices
-    fronts: Fronts
-
 
 @dataclass(frozen=True)
 class _Blocks:
@@ -240,6 +206,7 @@ class _Blocks:
 
     owned: Indices
     of: Indices
+    are_points: bool  # or frames
 
 
 def _arranged(derivatives: Indices, blocks: _Blocks, numbers: Indices) -> Iterator[Touched]:
@@ -340,17 +307,24 @@ def whitened_rows(
     """Whiten the rows B dx = w of all blocks: multiply each pair by L^-1, where A C A' = L L'.
 
     F is 0 at the computed observations, so that w = -A (l_obs - l_k) = A v, with v (n, 2) = computed minus observed.
-    The derivatives B in `at` are overwritten.
+    The derivatives B in `at` are overwritten. Further observations have the rows f'(x) dx = l - f(x); all their
+    unknowns are shared.
     """
-    a, matrix = at.by_observation, at.by_unknowns
-    further = tuple(_further_block(numbering, each, values) for each in numbering.problem.further)
+    a, matrix, further = at.by_observation, at.by_unknowns, list[Blocks]()
+    for each in numbering.problem.further:
+        numbers = numbering.numbers[each.positions]
+        free, of_each = numbers != ABSENT, np.linalg.cholesky(each.covariance)
+        by_unknowns = np.linalg.solve(of_each, each.jacobian(values)[:, free])
+        difference = np.linalg.solve(of_each, each.observed - each.computed(values))
+        nothing = np.empty((1, 0), dtype=np.intp)
+        further.append(Blocks(nothing, numbers[None, free], by_unknowns[None], difference[None]))
     if compiled.kernels is not None:
         root, right = np.empty(a.shape), np.empty(v_mm.shape)
         compiled.kernels.whiten_rows(a, covariance_mm2, v_mm, root, matrix, right)
-        return WhitenedRows(numbering, root, matrix, right, further)
+        return WhitenedRows(numbering, root, matrix, right, tuple(further))
     root = lower_root(product(product(a, covariance_mm2), a.transpose(0, 2, 1)))
     right = _whitened(root, applied(a, v_mm)[..., None])[..., 0]
-    return WhitenedRows(numbering, root, _whitened(root, matrix), right, further)
+    return WhitenedRows(numbering, root, _whitened(root, matrix), right, tuple(further))
 
 
 def _whitened(root: Array, rows: Array) -> Array:
@@ -390,27 +364,9 @@ def _row_values(values: Array, rows: Indices) -> Array:
     return np.asarray(values[rows])
 
 
-def _further_block(numbering: Numbering, further: FurtherObservation, values: Array) -> Blocks:
-    """Rows f'(x) dx = l - f(x) of a further observation, all of whose unknowns are shared."""
-    numbers = numbering.numbers[further.positions]
-    free = numbers != ABSENT
-    root = np.linalg.cholesky(further.covariance)
-    matrix = np.linalg.solve(root, further.jacobian(values)[:, free])
-    right = np.linalg.solve(root, further.observed - further.computed(values))
-    return Blocks(np.empty((1, 0), dtype=np.intp), numbers[None, free], matrix[None], right[None])
-
-
 def prior_root_weights(numbering: Numbering) -> Array:
     """(f,) inverse prior standard deviations of the free unknowns, of pseudo-observations too; 0 without a prior."""
     return np.asarray(1.0 / numbering.problem.prior_sigma[numbering.free])
-
-
-def camera_mask(numbering: Numbering) -> Mask:
-    """(f,) mask of the free unknowns of cameras (F5 to F9: fiducials, interior orientation, distortion) and
-    scanners."""
-    unknowns = numbering.problem.unknowns
-    positions = [*unknowns.camera.values(), *unknowns.fiducial.values(), *unknowns.scanner.values()]
-    return np.isin(numbering.free, np.concatenate(positions))
 
 
 def prior_differences(problem: Problem, state: State) -> Array:

@@ -11,7 +11,6 @@ from adjust.array_types import Array
 from adjust.least_squares.equations import (
     Numbering,
     WhitenedRows,
-    camera_mask,
     prior_differences,
     prior_root_weights,
     whitened_rows,
@@ -99,10 +98,12 @@ def _vpv(rows: WhitenedRows, state: State) -> float:
 
 
 def factorise(numbering: Numbering, at: Linearised, damping: float = 0.0, camera_priors: bool = True) -> Factor:
-    """Factorise the normal equations, with or without the priors of the cameras (F5 to F9)."""
+    """Factorise the normal equations, with or without the priors of the cameras (F5 to F9) and scanners."""
     weights = prior_root_weights(numbering)
     if not camera_priors:
-        weights = np.where(camera_mask(numbering), 0.0, weights)
+        of = numbering.problem.unknowns
+        positions = [*of.camera.values(), *of.fiducial.values(), *of.scanner.values()]
+        weights = np.where(np.isin(numbering.free, np.concatenate(positions)), 0.0, weights)
     differences = prior_differences(numbering.problem, at.state)[numbering.free]
     system = len(numbering.free), weights, weights * differences
     # Without these priors the factor only serves to find weak directions, so it need not be sharp.
@@ -151,7 +152,12 @@ def iterate(
         history.append(Iteration(at.vpv, moved.sigmas, moved.damping, moved.attempts))
         if moved.damping == 0.0 and _stands_still(history):
             return Solution(at, at.factor, "converged", tuple(history))
-        damping, lately = _eased(moved.damping, moved.gain), moved.damping or lately
+        lately = moved.damping or lately
+        if moved.damping == 0.0:
+            damping = 0.0 if moved.gain > POOR_GAIN else FIRST_DAMPING
+        else:  # smaller if the linear prediction was good, larger if it was not
+            damping = moved.damping * max(LARGEST_EASING, 1.0 - (2.0 * moved.gain - 1.0) ** 3)
+            damping = damping if damping > LEAST_DAMPING else 0.0
     return Solution(at, at.factor, "iteration limit", tuple(history))
 
 
@@ -180,14 +186,6 @@ def _stands_still(history: list[Iteration]) -> bool:
         return True
     undamped = len(steps) == 3 and not any(each.damping for each in history[-3:])
     return undamped and steps[2] * max(steps[1] / steps[0], steps[2] / steps[1]) < FORESEEN * STANDSTILL_SIGMAS
-
-
-def _eased(damping: float, gain: float) -> float:
-    """Damping of the next step: smaller if the linear prediction was good, larger if it was not (Nielsen 1999)."""
-    if damping == 0.0:
-        return 0.0 if gain > POOR_GAIN else FIRST_DAMPING
-    eased = damping * max(LARGEST_EASING, 1.0 - (2.0 * gain - 1.0) ** 3)
-    return eased if eased > LEAST_DAMPING else 0.0
 
 
 @dataclass(frozen=True)

@@ -324,7 +324,10 @@ def eliminate(
     if sparse is not None and equations is not None:
         squares = sparse.column_squares(count, equations)
     else:
-        squares = _column_squares(blocks, count)
+        squares = np.zeros(count)
+        for block in blocks:
+            of_block = np.einsum("bmk,bmk->bk", block.matrix, block.matrix)
+            squares += np.bincount(column_values(np.arange(count), block).ravel(), of_block.ravel(), count)
     squares += prior_root_weight**2
     scale = np.where(squares > 0.0, np.sqrt(squares), 1.0)
     # Combine prior and damping of each unknown in one row: coefficient and right side.
@@ -338,39 +341,24 @@ def eliminate(
     return _reflect_all(blocks, scale, priors, fronts)
 
 
-def _column_squares(blocks: Iterable[Blocks], count: int) -> Array:
-    """Sums of squares (n,) of the columns."""
-    squares = np.zeros(count)
-    for block in blocks:
-        of_block = np.einsum("bmk,bmk->bk", block.matrix, block.matrix)
-        squares += np.bincount(column_values(np.arange(count), block).ravel(), of_block.ravel(), count)
-    return squares
-
-
 def _reflect_all(blocks: Iterable[Blocks], scale: Array, priors: tuple[Array, Array], fronts: Fronts | None) -> Factor:
-    factors = []
-    rests = []
+    """Factorise by Householder QR: the triangles of the blocks, then their remaining rows in the shared unknowns."""
+    factors, rests = [], []
     for block in blocks:
-        factor, rest = _eliminate_blocks(block, scale, priors)
-        factors.append(factor)
-        rests.append((block.shared, rest))
+        (count, height, width), own_count = block.matrix.shape, block.own.shape[1]
+        rows = np.zeros((count, height + own_count, width + 1))  # the right side last
+        np.divide(block.matrix, column_values(scale, block)[:, None, :], out=rows[:, :height, :-1])
+        rows[:, :height, -1] = block.right
+        rows[:, height:, :own_count] = priors[0][block.own][..., None] * np.eye(own_count)
+        rows[:, height:, -1] = priors[1][block.own]
+        reduced = qr_triangle(rows)
+        own = reduced[:, :own_count]
+        of_own = own[..., :own_count], own[..., own_count:-1], own[..., -1]
+        factors.append(BlockFactors(block.own, block.shared, *of_own))
+        rests.append((block.shared, reduced[:, own_count:, own_count:]))
     fronts = fronts or Fronts.single(len(scale) - sum(block.own.size for block in factors))
     triangle, right = reflected(fronts, rests, *(prior[: fronts.count] for prior in priors))
     return Factor(DenseBlocks(tuple(factors)), triangle, right, scale)
-
-
-def _eliminate_blocks(blocks: Blocks, scale: Array, priors: tuple[Array, Array]) -> tuple[BlockFactors, Array]:
-    """Triangles of blocks, and their remaining rows (b, k, s + 1) in the shared unknowns, the right side last."""
-    (count, height, width), own_count = blocks.matrix.shape, blocks.own.shape[1]
-    rows = np.zeros((count, height + own_count, width + 1))
-    np.divide(blocks.matrix, column_values(scale, blocks)[:, None, :], out=rows[:, :height, :-1])
-    rows[:, :height, -1] = blocks.right
-    rows[:, height:, :own_count] = priors[0][blocks.own][..., None] * np.eye(own_count)
-    rows[:, height:, -1] = priors[1][blocks.own]
-    triangle = qr_triangle(rows)
-    own = triangle[:, :own_count]
-    factor = BlockFactors(blocks.own, blocks.shared, own[..., :own_count], own[..., own_count:-1], own[..., -1])
-    return factor, triangle[:, own_count:, own_count:]
 
 
 def _eliminate_normally(

@@ -86,7 +86,12 @@ class Triangle:
 
     def lifted(self, least: float) -> "Triangle":
         """Raise diagonal elements to at least `least` in absolute value; singular values change by no more."""
-        return replace(self, own=tuple(_lifted(own, least) for own in self.own))
+        lifted = []
+        for own in self.own:
+            diagonal = np.diag(own)
+            lift = np.where(np.abs(diagonal) < least, np.where(diagonal < 0.0, -least, least) - diagonal, 0.0)
+            lifted.append(np.asarray(own + np.diag(lift)))
+        return replace(self, own=tuple(lifted))
 
     @cached_property
     def largest_singular(self) -> float:
@@ -233,12 +238,6 @@ def _solved(triangle: Array, right: Array, transposed: bool = False) -> Array:
     return np.asarray(solved)
 
 
-def _lifted(triangle: Array, least: float) -> Array:
-    diagonal = np.diag(triangle)
-    lift = np.where(np.abs(diagonal) < least, np.where(diagonal < 0.0, -least, least) - diagonal, 0.0)
-    return np.asarray(triangle + np.diag(lift))
-
-
 Rows = tuple[Indices, Array]  # unknowns (b, s) and rows (b, k, s + 1) in them, the right side last
 
 
@@ -250,8 +249,16 @@ def reflected(
     All unknowns of a row must be in the front that owns the first of them.
     """
     of_front: list[list[Rows]] = [[] for _ in fronts]
-    for i, some in _distributed(fronts, rows):
-        of_front[i].append(some)
+    for unknowns, each in rows:
+        if unknowns.shape[1] == 0:
+            continue
+        home = fronts.home(unknowns)
+        if (home == home[0]).all():
+            of_front[home[0]].append((unknowns, each))
+            continue
+        order = np.argsort(home, kind="stable")
+        for members in np.split(order, np.flatnonzero(np.diff(home[order])) + 1):
+            of_front[home[members[0]]].append((unknowns[members], each[members]))
     own, borders = [], []
     right = np.empty(len(prior_right))
     for front, of_this in zip(fronts, of_front, strict=True):
@@ -267,8 +274,7 @@ def reflected(
         right[front.own] = triangle[: front.count, -1]
         left = triangle[front.count : front.width, front.count :]
         if left.size:
-            home = int(fronts.home(front.after))
-            of_front[home].append((columns[None, front.count :], left[None]))
+            of_front[int(fronts.home(front.after))].append((columns[None, front.count :], left[None]))
     return Triangle(fronts, tuple(own), tuple(borders)), right
 
 
@@ -323,20 +329,6 @@ def reflections_cost(fronts: Fronts, first: Indices, heights: Indices) -> float:
     home = fronts.home(first[heights > 0, None])
     of_front = np.bincount(home, heights[heights > 0], len(fronts))
     return float((of_front * np.array([front.width for front in fronts]) ** 2).sum())
-
-
-def _distributed(fronts: Fronts, rows: Iterable[Rows]) -> Iterator[tuple[int, Rows]]:
-    """Assign rows to the fronts that own their first unknowns."""
-    for unknowns, each in rows:
-        if unknowns.shape[1] == 0:
-            continue
-        home = fronts.home(unknowns)
-        if (home == home[0]).all():
-            yield int(home[0]), (unknowns, each)
-            continue
-        order = np.argsort(home, kind="stable")
-        for members in np.split(order, np.flatnonzero(np.diff(home[order])) + 1):
-            yield int(home[members[0]]), (unknowns[members], each[members])
 
 
 def _condensed(rows: Sequence[Rows], priors: Array) -> Array:

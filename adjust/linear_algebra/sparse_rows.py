@@ -188,11 +188,14 @@ class SharedEquations:
 
     def add_squares(self, unknowns: Indices, home: Indices, squares: Array) -> None:
         """Add normal matrices (b, s, s) of unknowns (b, s), -1 for none, to those of their fronts home (b,)."""
-        of_fronts = self.squares
+        of_fronts, shape = self.squares, (self.fronts.count, self.fronts.count)
         for i in np.unique(home):
-            of_front = spread_squares(unknowns[home == i], squares[home == i], self.fronts.count).tocoo()
-            rows, columns = (self.fronts[int(i)].places(at.astype(np.intp)) for at in (of_front.row, of_front.col))
-            of_fronts[i][rows, columns] += of_front.data
+            own, values = unknowns[home == i], squares[home == i]
+            rows, columns = (np.broadcast_to(at, values.shape) for at in (own[:, :, None], own[:, None, :]))
+            there = (rows >= 0) & (columns >= 0)
+            summed = csr_array(coo_array((values[there], (rows[there], columns[there])), shape=shape)).tocoo()
+            rows, columns = (self.fronts[int(i)].places(at.astype(np.intp)) for at in (summed.row, summed.col))
+            of_fronts[i][rows, columns] += summed.data
 
 
 def batches(first: Indices) -> Iterator[slice]:
@@ -211,10 +214,3 @@ def take_columns(matrix: Array, columns: Indices, order: Indices) -> Array:
         for axis in range(2):
             into[axis] = matrix[:, axis, i][order]
     return taken
-
-
-def spread_squares(unknowns: Indices, squares: Array, count: int) -> csr_array:
-    """Sum (n, n) of matrices (b, s, s) of unknowns (b, s), -1 for none."""
-    rows, columns = (np.broadcast_to(at, squares.shape) for at in (unknowns[:, :, None], unknowns[:, None, :]))
-    there = (rows >= 0) & (columns >= 0)
-    return csr_array(coo_array((squares[there], (rows[there], columns[there])), shape=(count, count)))

@@ -270,7 +270,7 @@ def _film_derivatives(problem: Problem, state: State, xy_mm: Array) -> _FilmDeri
         parameters, rows = state.values[films.positions][films.of], _as_slice(films.rows)
         film.camera_xy[rows] = films.kind.apply(parameters, straight_mm[rows])
         film.xy_jacobian[rows] = films.kind.gradient(parameters, straight_mm[rows])
-        design = films.kind.design(parameters, straight_mm[rows], films.centers_mm, films.halves_mm)
+        design = films.kind.design(parameters, straight_mm[rows], films.centers_mm, films.half_mm[films.of])
         film.parameter_jacobian[rows, :, : design.shape[2]] = design
     for scans in problem.scans:
         rows = scans.rows
@@ -292,8 +292,8 @@ def blind_marks(problem: Problem, state: State) -> dict[str, tuple[str, str]]:
     Returns by image name the reason and what to check, empty where all marks have an image. The empty name stands for a
     fault of a whole camera.
     """
-    observations, numbers = problem.network.observations, problem.image_numbers
-    blind: dict[int, tuple[str, str]] = {}
+    observations, blind = problem.network.observations, dict[str, tuple[str, str]]()
+    images = [problem.network.images[number] for number in problem.image_numbers]
     targets = [_image_targets(problem, state, name, rows) for name, rows in problem.targets_by_camera.items()]
     for shown, rows in zip(targets, problem.targets_by_camera.values(), strict=True):
         lens = _lens(problem, state, shown.camera)
@@ -303,34 +303,27 @@ def blind_marks(problem: Problem, state: State) -> dict[str, tuple[str, str]]:
             )
             return {"": (reason, "Give a positive one.")}
         _, found = lens.camera_from_image(shown.imaged)
-        for which, is_behind in ((shown.in_camera[:, 2] >= 0.0, True), (~found, False)):
-            for row in _first_of_images(rows[which], numbers):
-                blind.setdefault(numbers[row], _blind_target(problem, row, is_behind))
+        behind = rows[shown.in_camera[:, 2] >= 0.0]
+        for number, row in enumerate([*behind, *rows[~found]]):
+            why, check = "is where the distortion folds over", "the values from which the distortion starts"
+            if number < len(behind):
+                why = "lies behind the camera"
+                check = "the sign of W: M rotates from object to camera, which looks along its negative z axis"
+            placed = (
+                "the number and the coordinates of the point"
+                if images[row].exterior is None
+                else "the given orientation"
+            )
+            reason = f"point {observations.point[row]} {why} in image {images[row].name}"
+            blind.setdefault(images[row].name, (reason, f"Check {placed}, and {check}."))
     camera_xy = None if blind else _computed_in_camera(problem, state, targets)
     if camera_xy is not None:
         _, found = _computed_in_comparator(problem, state, camera_xy)
-        for row in _first_of_images(np.flatnonzero(~found), numbers):
-            image = problem.network.images[numbers[row]]
+        for row in np.flatnonzero(~found):
             reason = (
-                f"{observations.kind[row]} {observations.point[row]} is where the {image.transformation} "
-                f"transformation of image {image.name} folds over"
+                f"{observations.kind[row]} {observations.point[row]} is where the {images[row].transformation} "
+                f"transformation of image {images[row].name} folds over"
             )
             check = "Check its number and those of the fiducial marks, or choose a transformation of a lower order."
-            blind[numbers[row]] = reason, check
-    return {problem.network.images[number].name: reason for number, reason in blind.items()}
-
-
-def _first_of_images(rows: Indices, image_numbers: Indices) -> list[int]:
-    """First of some rows in each image."""
-    return [int(rows[at]) for at in sorted(np.unique(image_numbers[rows], return_index=True)[1])]
-
-
-def _blind_target(problem: Problem, row: int, is_behind: bool) -> tuple[str, str]:
-    image = problem.network.images[problem.image_numbers[row]]
-    placed = "the number and the coordinates of the point" if image.exterior is None else "the given orientation"
-    why, check = "is where the distortion folds over", "the values from which the distortion starts"
-    if is_behind:
-        why = "lies behind the camera"
-        check = "the sign of W: M rotates from object to camera, which looks along its negative z axis"
-    reason = f"point {problem.network.observations.point[row]} {why} in image {image.name}"
-    return reason, f"Check {placed}, and {check}."
+            blind.setdefault(images[row].name, (reason, check))
+    return blind

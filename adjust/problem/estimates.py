@@ -196,17 +196,11 @@ def observed_places(estimates: Estimates, camera: str, xy_mm: Array) -> tuple[In
 
 
 def adjusted_places(estimates: Estimates, points: Sequence[str]) -> Array:
-    """(n, 3) adjusted coordinates of object points, including the bend of their board."""
+    """(n, 3) adjusted coordinates of object points, including the bends of their boards."""
     places = estimates.values_of(Parameter.point(point, axis) for point in points for axis in "XYZ").reshape(-1, 3)
-    return places + lifted(estimates, points)
-
-
-def lifted(estimates: Estimates, points: Sequence[str]) -> Array:
-    """(n, 3) displacements of object points from their flat places by the bends of boards."""
-    offsets = np.zeros((len(points), 3))
     for board in estimates.network.boards:
         bends = estimates.values_of(Parameter.board(board.name, name) for name in board.names)
         for row, point in enumerate(points):
             if point in board.places:
-                offsets[row] = bends @ board.lift_directions[point]
-    return offsets
+                places[row] += bends @ board.lift_directions[point]
+    return places

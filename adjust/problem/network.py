@@ -21,8 +21,6 @@ from adjust.problem.camera import Camera, FiducialDistance
 from adjust.problem.observations import Calibration, Distance, Observations
 
 Transformation = str  # name as in `adjust.functional_model.transformation`
-
-
 EXTERIOR_NAMES = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
 
 
@@ -263,11 +261,6 @@ class Network:
         return np.array([number.setdefault(image.frame, len(number)) for image in self.images], dtype=np.intp)
 
     @cached_property
-    def has_parts(self) -> bool:
-        """Whether a frame was scanned in several parts."""
-        return any(image.part_of for image in self.images)
-
-    @cached_property
     def joins(self) -> dict[tuple[str, str], Indices]:
         """Rows of the observations of each join, by frame and point."""
         rows: dict[tuple[str, str], list[int]] = {}
@@ -339,19 +332,17 @@ class Network:
 
     @cached_property
     def extent_by_image(self) -> dict[str, Extent]:
+        """Extent of the observations by image; 1 mm for an image with fewer than two places."""
         numbers = self.image_numbers
         lowest, highest = np.full((len(self.images), 2), np.inf), np.full((len(self.images), 2), -np.inf)
         for axis, places_mm in enumerate(self.observations.xy_mm.T):  # quicker than both axes at once
             np.minimum.at(lowest[:, axis], numbers, places_mm)
             np.maximum.at(highest[:, axis], numbers, places_mm)
-        return {image.name: _extent(lowest[i], highest[i]) for i, image in enumerate(self.images)}
-
-
-def _extent(lowest: Array, highest: Array) -> Extent:
-    """Extent between two corners; 1 mm for an image with fewer than two places."""
-    if not np.isfinite(lowest).all():
-        return Extent(np.zeros(2), 1.0)
-    return Extent((lowest + highest) / 2.0, float((highest - lowest).max()) / 2.0 or 1.0)
+        extents = dict.fromkeys((image.name for image in self.images), Extent(np.zeros(2), 1.0))
+        for i in np.flatnonzero(np.isfinite(lowest).all(axis=1)):
+            half_mm = float((highest[i] - lowest[i]).max()) / 2.0 or 1.0
+            extents[self.images[i].name] = Extent((lowest[i] + highest[i]) / 2.0, half_mm)
+        return extents
 
 
 @dataclass(frozen=True, repr=False)

@@ -85,13 +85,16 @@ class Parameter(NamedTuple):
         """Name in files: `IO.<camera>.k3`, `FID.<camera>.<id>.x`, `PT.<id>.X`.
 
         The text is unique, and `parameter_from_text` reads it back: if it holds two names, a dot in the second is
-        written %2E.
+        written %2E, and a percent sign %25 where it would be ambiguous.
         """
         match self.kind:
             case "point":
                 owner = self.id
             case "fiducial" | "join" if self.id:
-                owner = f"{self.owner}.{_escape_dots(self.id)}"
+                id = self.id
+                if "." in id or "%" in id:
+                    id = re.sub(r"%(?=2E|25)", "%25", id).replace(".", "%2E")
+                owner = f"{self.owner}.{id}"
             case _:
                 owner = self.owner
         return f"{CODES[self.kind]}.{owner}.{self.quantity}"
@@ -163,7 +166,8 @@ def _parameter(text: str) -> Parameter:
     owner, dot, id = owner.rpartition(".")
     if not dot:
         raise ValueError(f"{text!r} names no quantity of an adjustment: {CODES[kind]} takes two names")
-    return Parameter(kind, owner, _unescape_dots(id), quantity)
+    id = re.sub(r"%(2E|25)", lambda escaped: "." if escaped[1] == "2E" else "%", id)
+    return Parameter(kind, owner, id, quantity)
 
 
 def as_parameter(parameter: Parameter | str) -> Parameter:
@@ -177,15 +181,6 @@ def object_coordinate(text: str) -> Parameter:
     if axis not in ("X", "Y", "Z"):
         raise DatumError(f"The datum coordinate {text} is none: write the point, a dot and X, Y or Z, such as 12.X.")
     return Parameter.point(point, axis)
-
-
-def _escape_dots(name: str) -> str:
-    """Escape dots as %2E, and a percent sign as %25 where it would be ambiguous."""
-    return re.sub(r"%(?=2E|25)", "%25", name).replace(".", "%2E") if "." in name or "%" in name else name
-
-
-def _unescape_dots(name: str) -> str:
-    return re.sub(r"%(2E|25)", lambda found: "." if found[1] == "2E" else "%", name)
 
 
 def enumeration(names: Sequence[str]) -> str:

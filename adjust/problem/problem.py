@@ -65,11 +65,6 @@ class Films:
         """(n, 2) centre of the extent of each observation's image."""
         return np.asarray(self.center_mm.T[:, self.of].T)
 
-    @cached_property
-    def halves_mm(self) -> Array:
-        """(n,) half size of the extent of each observation's image."""
-        return self.half_mm[self.of]
-
 
 @dataclass(frozen=True)
 class Scans:

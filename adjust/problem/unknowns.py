@@ -16,7 +16,7 @@ from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.camera import Camera
-from adjust.problem.network import EXTERIOR_NAMES, Approximations, Image, Network, ObjectPoint
+from adjust.problem.network import EXTERIOR_NAMES, Approximations, Network, ObjectPoint
 from adjust.problem.parameter import Kind, Parameter
 
 Quantity = tuple[str, Prior | None, float | None]  # name, prior, approximation
@@ -83,21 +83,7 @@ def list_unknowns(network: Network, approximations: Approximations) -> Unknowns:
     neither a value nor an approximation.
     """
     rows = _Rows([], [], [])
-    used = {image.camera for image in network.images}
-    camera, fiducial = dict[str, Indices](), dict[tuple[str, str], Indices]()
-    for each in network.cameras:
-        if each.name in used:
-            quantities = _camera_quantities(each, approximations)
-            idle = each.name in network.idle_cameras
-            camera[each.name] = rows.add("interior", each.name, "", _stopped(quantities) if idle else quantities)
-            datum = fiducial_datum(each, network.observed_fiducials, idle)
-            for id_, mark in each.fiducials.items():
-                hold = (each.name, id_) not in network.observed_fiducials
-                pair = [
-                    (axis, _hold(prior) if hold or (id_, axis) in datum else prior, None)
-                    for axis, prior in zip("xy", (mark.x_mm, mark.y_mm), strict=True)
-                ]
-                fiducial[each.name, id_] = rows.add("fiducial", each.name, id_, pair)
+    camera, fiducial = _add_cameras(rows, network, approximations)
     scanner = {
         each.name: rows.add("scanner", each.name, "", [(name, prior, None) for name, prior in each.terms.items()])
         for each in network.scanners
@@ -109,16 +95,7 @@ def list_unknowns(network: Network, approximations: Approximations) -> Unknowns:
         for each in network.boards
     }
     point = rows.add_points([each for each in network.points if each.id in network.observed_points], approximations)
-    transformation, exterior = dict[str, Indices](), dict[str, Indices]()
-    of_frame: dict[str, Indices] = {}
-    for image in network.images:
-        if image.frame not in of_frame:
-            quantities = _exterior_quantities(image, approximations)
-            stopped = image.name in network.unoriented
-            own = _stopped(quantities) if stopped else quantities
-            of_frame[image.frame] = rows.add("exterior", image.frame, "", own)
-        exterior[image.name] = of_frame[image.frame]
-        transformation[image.name] = rows.add("film", image.name, "", _transformation_quantities(image, approximations))
+    transformation, exterior = _add_images(rows, network, approximations)
     join = {
         (frame, id_): rows.add("join", frame, id_, [("x", None, float(x_mm)), ("y", None, float(y_mm))])
         for (frame, id_), (x_mm, y_mm) in approximations.joins.items()
@@ -134,6 +111,68 @@ def list_unknowns(network: Network, approximations: Approximations) -> Unknowns:
         )
     owned = camera, fiducial, scanner, point, transformation, exterior, join, board
     return Unknowns(tuple(rows.parameters), given, sigma, start, *owned)
+
+
+def _add_cameras(
+    rows: "_Rows", network: Network, approximations: Approximations
+) -> tuple[dict[str, Indices], dict[tuple[str, str], Indices]]:
+    """List the interior orientations and fiducials of cameras with an image; returns their positions."""
+    camera, fiducial = dict[str, Indices](), dict[tuple[str, str], Indices]()
+    used = {image.camera for image in network.images}
+    for each in network.cameras:
+        if each.name not in used:
+            continue
+        interior = approximations.interior.get(each.name)
+        starts = (None, None, None) if interior is None else tuple(float(value) for value in interior)
+        priors = (each.principal_distance_mm, each.x0_mm, each.y0_mm)
+        quantities: list[Quantity] = list(zip(("c", "x0", "y0"), priors, starts, strict=True))
+        given, distortion = each.distortion.parameters, approximations.distortion.get(each.name, {})
+        names = parameter_names(each.distortion.family)
+        quantities += [(name, given.get(name, Prior(0.0, 0.0)), distortion.get(name)) for name in names]
+        idle = each.name in network.idle_cameras
+        camera[each.name] = rows.add("interior", each.name, "", _stopped(quantities) if idle else quantities)
+        datum = fiducial_datum(each, network.observed_fiducials, idle)
+        for id_, mark in each.fiducials.items():
+            pair: list[Quantity] = []
+            for axis, prior in zip("xy", (mark.x_mm, mark.y_mm), strict=True):
+                is_held = (each.name, id_) not in network.observed_fiducials or (id_, axis) in datum
+                # A prior makes an unobserved coordinate regular; only a free one is fixed.
+                fixed = is_held and np.isinf(prior.sigma)
+                pair.append((axis, Prior(prior.value, 0.0) if fixed else prior, None))
+            fiducial[each.name, id_] = rows.add("fiducial", each.name, id_, pair)
+    return camera, fiducial
+
+
+def _add_images(
+    rows: "_Rows", network: Network, approximations: Approximations
+) -> tuple[dict[str, Indices], dict[str, Indices]]:
+    """List the exterior orientations of the frames and the film transformations of their scans; returns their
+    positions by image."""
+    transformation, exterior, of_frame = dict[str, Indices](), dict[str, Indices](), dict[str, Indices]()
+    for image in network.images:
+        if image.frame not in of_frame:
+            start = approximations.exterior.get(image.name)
+            starts = [None] * 6 if start is None else [float(value) for value in start]
+            priors: list[Prior | None] = [None] * 6
+            if image.exterior is not None:
+                given = zip(image.exterior.values, image.exterior.sigmas, strict=True)
+                priors = [Prior(float(value), float(sigma)) for value, sigma in given]
+                if image.exterior.has_antenna:
+                    priors[:3] = [None] * 3  # the antenna is observed, not the projection centre
+            quantities: list[Quantity] = list(zip(EXTERIOR_NAMES, priors, starts, strict=True))
+            own = _stopped(quantities) if image.name in network.unoriented else quantities
+            of_frame[image.frame] = rows.add("exterior", image.frame, "", own)
+        exterior[image.name] = of_frame[image.frame]
+        names = film_parameter_names(image.transformation)
+        film = approximations.transformation.get(image.name, np.full(len(names), np.nan))
+        if len(film) != len(names):
+            raise AdjustmentError(
+                f"image {image.name}: a transformation of the kind {image.transformation} has {len(names)} parameters "
+                f"({', '.join(names)}), but {len(film)} approximations are given."
+            )
+        of_film = [(name, None, float(value)) for name, value in zip(names, film, strict=True)]
+        transformation[image.name] = rows.add("film", image.name, "", of_film)
+    return transformation, exterior
 
 
 @dataclass(frozen=True)
@@ -188,48 +227,9 @@ def fiducial_datum(camera: Camera, observed: Collection[tuple[str, str]], idle: 
     return frozenset({across} if is_placed else {(first, "x"), (first, "y"), across})
 
 
-def _hold(prior: Prior) -> Prior:
-    """Prior of a quantity without observations: fixed if free, else unchanged, since its prior makes it regular."""
-    return prior if np.isfinite(prior.sigma) else Prior(prior.value, 0.0)
-
-
 def _stopped(quantities: list[Quantity]) -> list[Quantity]:
     """Fix quantities that are not adjusted at their given values, or at 1 as a placeholder."""
     return [(name, Prior(1.0 if prior is None else prior.value), None) for name, prior, _ in quantities]
-
-
-def _camera_quantities(camera: Camera, approximations: Approximations) -> list[Quantity]:
-    interior = approximations.interior.get(camera.name)
-    starts = (None, None, None) if interior is None else tuple(float(value) for value in interior)
-    priors = (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm)
-    quantities: list[Quantity] = list(zip(("c", "x0", "y0"), priors, starts, strict=True))
-    names = parameter_names(camera.distortion.family)
-    given = camera.distortion.parameters
-    distortion = approximations.distortion.get(camera.name, {})
-    return quantities + [(name, given.get(name, Prior(0.0, 0.0)), distortion.get(name)) for name in names]
-
-
-def _exterior_quantities(image: Image, approximations: Approximations) -> list[Quantity]:
-    start = approximations.exterior.get(image.name)
-    starts = [None] * 6 if start is None else [float(value) for value in start]
-    priors: list[Prior | None] = [None] * 6
-    if image.exterior is not None:
-        rows = zip(image.exterior.values, image.exterior.sigmas, strict=True)
-        priors = [Prior(float(value), float(sigma)) for value, sigma in rows]
-        if image.exterior.has_antenna:
-            priors[:3] = [None] * 3  # the antenna is observed, not the projection centre
-    return list(zip(EXTERIOR_NAMES, priors, starts, strict=True))
-
-
-def _transformation_quantities(image: Image, approximations: Approximations) -> list[Quantity]:
-    names = film_parameter_names(image.transformation)
-    start = approximations.transformation.get(image.name, np.full(len(names), np.nan))
-    if len(start) != len(names):
-        raise AdjustmentError(
-            f"image {image.name}: a transformation of the kind {image.transformation} has {len(names)} parameters "
-            f"({', '.join(names)}), but {len(start)} approximations are given."
-        )
-    return [(name, None, float(value)) for name, value in zip(names, start, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -243,9 +243,12 @@ class Reduction:
         """Choose a round origin near the centre of the given coordinates; zero where the field includes the origin.
 
         The origin is a multiple of a power of two near the field's extent, so that no digit of a coordinate is lost.
-        Heights are not reduced where the line of sight depends on them.
+        Heights are not reduced where the line of sight depends on them. Where no point is given, stations count.
         """
-        xyz = _given_places(network)
+        xyz, _ = network.point_priors
+        if np.isnan(xyz).all():
+            stations = [image.exterior.center for image in network.images if image.exterior is not None]
+            xyz = np.array(stations).reshape(-1, 3)
         given = [axis[~np.isnan(axis)] for axis in xyz.T]
         middle = np.array([np.median(axis) if len(axis) else 0.0 for axis in given])
         off = [np.abs(axis - center) for axis, center in zip(given, middle, strict=True) if len(axis)]
@@ -269,8 +272,7 @@ class Reduction:
         """Reduce a network."""
         if self.is_none:
             return network
-        shift = self._element_shift
-        images, points = [], []
+        shift, images, points = np.append(self.origin, np.zeros(3)), [], []
         for image in network.images:
             given = image.exterior and replace(image.exterior, values=image.exterior.values - shift)
             images.append(replace(image, exterior=given))
@@ -288,9 +290,10 @@ class Reduction:
         """Reduce approximations."""
         if self.is_none:
             return start
+        shift = np.append(self.origin, np.zeros(3))
         return replace(
             start,
-            exterior={image: values - self._element_shift for image, values in start.exterior.items()},
+            exterior={image: values - shift for image, values in start.exterior.items()},
             points={point: xyz - self.origin for point, xyz in start.points.items()},
         )
 
@@ -306,16 +309,3 @@ class Reduction:
                 if prior is not None and prior.sigma == 0.0 and unknowns.sigma[at] == 0.0:
                     whole[at] = prior.value
         return whole
-
-    @property
-    def _element_shift(self) -> Array:
-        """(6,) shift of an exterior orientation."""
-        return np.append(self.origin, np.zeros(3))
-
-
-def _given_places(network: Network) -> Array:
-    """(n, 3) given coordinates of the points, else of the stations; nan where not given."""
-    places, _ = network.point_priors
-    if not np.isnan(places).all():
-        return places
-    return np.array([image.exterior.center for image in network.images if image.exterior is not None]).reshape(-1, 3)

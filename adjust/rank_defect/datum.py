@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adjust.array_types import Array, Indices, Mask
+from adjust.array_types import Array, Indices
 from adjust.errors import DatumError
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.rotation import angles_near, rotation_from_vector
@@ -41,10 +41,22 @@ class ObjectDatum:
 
 def object_datum(problem: Problem, state: State, tolerance: float = EXACT) -> ObjectDatum:
     """Find the similarity transformations that leave all given coordinates, stations, attitudes and distances alone."""
-    placed = _point_positions(problem) if problem.unknowns.point else problem.exterior[:, :3]
-    center = state.values[placed].mean(axis=0)
-    extent = float(np.sqrt(((state.values[placed] - center) ** 2).sum(axis=1).mean())) or 1.0
-    generators = _generators(problem, state, center, extent)
+    points, stations = _point_positions(problem), problem.exterior[:, :3]
+    placed = state.values[points if len(points) else stations]
+    center = placed.mean(axis=0)
+    extent = float(np.sqrt(((placed - center) ** 2).sum(axis=1).mean())) or 1.0
+    generators = np.zeros((len(problem.unknowns), 7))
+    positions = np.concatenate([points, stations])
+    lever = (state.values[positions] - center) / extent
+    generators[positions, :3] = np.eye(3)
+    for axis in range(3):
+        generators[positions, 3 + axis] = np.cross(np.eye(3)[axis], lever)
+    generators[positions, 6] = lever
+    # A rotation R of the object changes M to M R', that is by the rotation vector -M r.
+    turned = np.linalg.solve(problem.attitude_by_unknowns(state), -state.rotations) / extent
+    generators[problem.exterior[:, 3:], 3:6] = turned
+    for name in problem.network.unoriented:
+        generators[problem.unknowns.exterior[name]] = 0.0
     moved = generators.copy()
     moved[problem.exterior[:, 3:]] *= extent  # angles to lengths
     hindered = moved[np.isfinite(problem.unknowns.sigma)]
@@ -64,37 +76,33 @@ def _point_positions(problem: Problem) -> Indices:
     return np.array(list(problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
 
 
-def _generators(problem: Problem, state: State, center: Array, extent: float) -> Array:
-    generators = np.zeros((len(problem.unknowns), 7))
-    placed = np.concatenate([_point_positions(problem), problem.exterior[:, :3]])
-    lever = (state.values[placed] - center) / extent
-    generators[placed, :3] = np.eye(3)
-    for axis in range(3):
-        generators[placed, 3 + axis] = np.cross(np.eye(3)[axis], lever)
-    generators[placed, 6] = lever
-    # A rotation R of the object changes M to M R', that is by the rotation vector -M r.
-    turned = np.linalg.solve(problem.attitude_by_unknowns(state), -state.rotations) / extent
-    generators[problem.exterior[:, 3:], 3:6] = turned
-    for name in problem.network.unoriented:
-        generators[problem.unknowns.exterior[name]] = 0.0
-    return generators
-
-
 def minimal_datum(problem: Problem) -> Indices:
     """Choose minimum constraints: positions of the coordinates that fix the free part of the datum.
 
     These are the planimetric coordinates of two distant points and the heights of these and a third point off their
-    line, where nothing else fixes them. Heights define no scale in a field flatter than a thousandth of its extent.
+    line, where nothing else fixes them, of points in at least two images. Heights define no scale in a field flatter
+    than a thousandth of its extent.
     """
-    state = problem.start()
+    state, sigma, positions = problem.start(), problem.unknowns.sigma, _point_positions(problem)
+    free = np.isinf(sigma[positions[:, :2]]).all(axis=1)
+    rays = np.bincount(problem.places[~problem.is_fiducial, 0], minlength=len(problem.unknowns))
+    usable = positions[free & (rays[positions[:, 0]] >= 2)]
+    if len(usable) == 0:
+        return np.empty(0, dtype=np.intp)
+    plan = state.values[usable[:, :2]]
+    a = int(np.argmax(((plan - plan.mean(axis=0)) ** 2).sum(axis=1)))
+    b = int(np.argmax(((plan - plan[a]) ** 2).sum(axis=1)))
+    along = plan[b] - plan[a]
+    c = int(np.argmax(np.abs((plan - plan[a]) @ np.array([-along[1], along[0]]))))
+    candidates = np.array([*usable[a], *usable[b], usable[c, 2], *usable[c, :2]])
+    candidates = candidates[np.isinf(sigma[candidates])]
     datum = object_datum(problem, state, FLAT)
-    candidates = _candidates(problem, state)
     motions, basis = datum.motions(candidates), np.zeros((0, datum.free.shape[1]))
     chosen: list[int] = []
     for leverage in LEVERAGES:
         more, basis = _independent(motions, leverage * np.linalg.norm(motions, axis=1), basis)
         chosen += more
-    return candidates[chosen]
+    return np.asarray(candidates[chosen])
 
 
 def _independent(motions: Array, least: Array | float, basis: Array) -> tuple[list[int], Array]:
@@ -109,47 +117,25 @@ def _independent(motions: Array, least: Array | float, basis: Array) -> tuple[li
     return chosen, basis
 
 
-def _candidates(problem: Problem, state: State) -> Indices:
-    """Free coordinates of points in at least two images, in the order in which they are to be fixed."""
-    positions = _point_positions(problem)
-    free = np.isinf(problem.unknowns.sigma[positions[:, :2]]).all(axis=1)
-    rays = np.bincount(problem.places[~problem.is_fiducial, 0], minlength=len(problem.unknowns))
-    usable = positions[free & (rays[positions[:, 0]] >= 2)]
-    if len(usable) == 0:
-        return np.empty(0, dtype=np.intp)
-    plan = state.values[usable[:, :2]]
-    a = int(np.argmax(((plan - plan.mean(axis=0)) ** 2).sum(axis=1)))
-    b = int(np.argmax(((plan - plan[a]) ** 2).sum(axis=1)))
-    along = plan[b] - plan[a]
-    c = int(np.argmax(np.abs((plan - plan[a]) @ np.array([-along[1], along[0]]))))
-    order = np.array([*usable[a], *usable[b], usable[c, 2], *usable[c, :2]])
-    return np.asarray(order[np.isinf(problem.unknowns.sigma[order])])
-
-
 def centered(problem: Problem, state: State, members: Indices) -> State:
     """Transform the state by the free similarity that brings some coordinates nearest to their given values, and, as
     far as these leave it open, the others nearest to their approximate values."""
     given = problem.unknowns.given[members]
-    is_given = ~np.isnan(given)
-    wanted = np.where(is_given, given, problem.unknowns.start[members])
+    first = ~np.isnan(given)
+    wanted = np.where(first, given, problem.unknowns.start[members])
     for _ in range(CENTERINGS):
         datum = object_datum(problem, state, FLAT)
-        amount = _nearest(datum.motions(members), wanted - state.values[members], is_given)
+        motion, off = datum.motions(members), wanted - state.values[members]
+        stacked = np.vstack([motion[first], np.zeros((motion.shape[1], motion.shape[1]))])
+        _, strength, right = np.linalg.svd(stacked, full_matrices=False)
+        left_open = right[strength <= FLAT * strength.max(initial=0.0)].T
+        amount = np.linalg.lstsq(motion[first], off[first], rcond=FLAT)[0]
+        rest = off[~first] - motion[~first] @ amount
+        amount = amount + left_open @ np.linalg.lstsq(motion[~first] @ left_open, rest)[0]
         state = _transformed(problem, state, datum, datum.free @ amount)
         if np.abs(amount).max(initial=0.0) <= EXACT * datum.extent:
             break
     return state
-
-
-def _nearest(motion: Array, off: Array, first: Mask) -> Array:
-    """(d,) least-squares amounts of motions (n, d) that produce off (n,): by the rows `first`, then, in their null
-    space, by the others."""
-    count = motion.shape[1]
-    _, strength, right = np.linalg.svd(np.vstack([motion[first], np.zeros((count, count))]), full_matrices=False)
-    left_open = right[strength <= FLAT * strength.max(initial=0.0)].T
-    amount = np.linalg.lstsq(motion[first], off[first], rcond=FLAT)[0]
-    rest = off[~first] - motion[~first] @ amount
-    return np.asarray(amount + left_open @ np.linalg.lstsq(motion[~first] @ left_open, rest)[0])
 
 
 def free_coordinates(problem: Problem, points: Sequence[str] = ()) -> Indices:

@@ -304,21 +304,18 @@ def weak_term_sentences(numbering: Numbering, state: State, factor: Factor, cofa
     lens = np.concatenate([positions[3:] for positions in unknowns.camera.values()])
     for name, terms in unknowns.scanner.items():
         hardly = terms[np.sqrt(cofactor.variances[terms]) * alone[terms] > HARDLY]
-        if len(hardly):
-            held = _held_variances(cofactor.part(np.array([*hardly, *lens[alone[lens] > 0.0]])), len(hardly))
-            names = [unknowns.parameters[position].quantity for position in hardly]
-            ratios = np.sqrt(held) * alone[hardly]
-            by_lens = [term for term, ratio in zip(names, ratios, strict=True) if ratio <= HARDLY]
-            yield from undetermined_term_sentences(name, names, by_lens, scan_poses(problem, state, name))
-
-
-def _held_variances(cofactor: Array, count: int) -> Array:
-    """Conditional variances of the first quantities of a cofactor matrix (n, n), given all others."""
-    own, by_others, others = cofactor[:count, :count], cofactor[:count, count:], cofactor[count:, count:]
-    scale = np.sqrt(np.diag(others))
-    reduced = by_others / scale
-    taken = (reduced @ np.linalg.pinv(others / np.outer(scale, scale), hermitian=True) * reduced).sum(axis=1)
-    return np.asarray(np.maximum(np.diag(own) - taken, 0.0))
+        if not len(hardly):
+            continue
+        # Conditional variances of the terms, given the distortion.
+        together, count = cofactor.part(np.array([*hardly, *lens[alone[lens] > 0.0]])), len(hardly)
+        own, by_lens, of_lens = together[:count, :count], together[:count, count:], together[count:, count:]
+        scale = np.sqrt(np.diag(of_lens))
+        reduced = by_lens / scale
+        taken = (reduced @ np.linalg.pinv(of_lens / np.outer(scale, scale), hermitian=True) * reduced).sum(axis=1)
+        ratios = np.sqrt(np.maximum(np.diag(own) - taken, 0.0)) * alone[hardly]
+        names = [unknowns.parameters[position].quantity for position in hardly]
+        known_lens = [term for term, ratio in zip(names, ratios, strict=True) if ratio <= HARDLY]
+        yield from undetermined_term_sentences(name, names, known_lens, scan_poses(problem, state, name))
 
 
 def undetermined_term_sentences(

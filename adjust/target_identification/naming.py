@@ -88,9 +88,11 @@ class Marks:
 
     @cached_property
     def _density_of_cell(self) -> Array:
-        """Look-up table of the density of marks."""
+        """Look-up table of the density of marks, from the distance of the k-th nearest mark."""
         mean = len(self.places) / float(np.prod(self.greatest - self.least))
-        return np.maximum(mark_density(self.tree, self._centres(_COARSE_CELLS)), mean)
+        crowd = min(_CROWD, self.tree.n)
+        reach = np.asarray(self.tree.query(self._centres(_COARSE_CELLS), k=[crowd])[0])[:, 0]
+        return np.asarray(np.maximum(crowd / (np.pi * np.maximum(reach, 1e-12) ** 2), mean))
 
     def _centres(self, cells: int) -> Array:
         """(cells², 2) centres of the cells, row by row."""
@@ -107,8 +109,9 @@ class Marks:
         return self._nearest_of_cell[self._cell(places, _CELLS)]
 
     def chance(self, places: Array, reach: Array) -> Array:
-        """Probability of a mark within reach (...) of places (..., 2), for random marks of the local density."""
-        return chance_of_a_mark(self._density_of_cell[self._cell(places, _COARSE_CELLS)], reach)
+        """Probability of a mark within reach (...) of places (..., 2), for random marks of this density (Poisson)."""
+        density = self._density_of_cell[self._cell(places, _COARSE_CELLS)]
+        return np.asarray(-np.expm1(-density * np.pi * np.square(reach)))
 
     def _cell(self, places: Array, cells: int) -> Indices:
         share = (places - self.least) / (self.greatest - self.least)
@@ -131,11 +134,6 @@ class View:
         p = self._ideal(xyz)
         return np.asarray((1.0 + self.scale) * p * (1.0 + self.radial * (p**2).sum(axis=1, keepdims=True)))
 
-    def facing(self, xyz: Array, normals: Array) -> Mask:
-        """Mask of points that face the camera; True where their direction is unknown."""
-        station = -self.rotation.T @ self.shift
-        return np.asarray(~(np.einsum("ni,ni->n", normals, station - xyz) <= 0.0))
-
     def derivatives(self, xyz: Array) -> Array:
         """(n, 2, 8) derivatives with respect to a small rotation, a shift in the camera frame, scale and radial."""
         p = self._ideal(xyz)
@@ -145,10 +143,6 @@ class View:
         by_scale = p * (1.0 + self.radial * r2)[:, None]
         by_radial = (1.0 + self.scale) * p * r2[:, None]
         return np.concatenate([by_pose, by_scale[:, :, None], by_radial[:, :, None]], axis=2)
-
-    def stepped(self, step: Array) -> "View":
-        turn = rotation_from_vector(step[:3])
-        return View(turn @ self.rotation, turn @ self.shift + step[3:6], self.scale + step[6], self.radial + step[7])
 
     def _camera(self, xyz: Array) -> Array:
         camera = xyz @ self.rotation.T + self.shift
@@ -169,18 +163,6 @@ class Grown:
     gate: float = 0.0  # largest distance of a mark from the predicted place of its point, in principal distances
     expected: int = 0  # number of points that the frame should show
     log10_chance: float = 0.0  # log10 of the expected number of false alarms over all possible hypotheses
-
-
-@dataclass(frozen=True, eq=False)
-class Poses:
-    """Poses, camera = R X + t, best first."""
-
-    # rotations, shifts: (k, 3, 3), (k, 3)
-    rotations: Array
-    shifts: Array
-    # for each pose the agreeing points around the cluster (indices) and their marks
-    named: list[tuple[Indices, Indices]]
-    tried: int  # number of poses tested
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,45 +233,55 @@ def name_marks(
 
 
 def _named_by_pattern(searches: Sequence["_Search"]) -> Names | str:
-    search, found = _first(searches)
-    if found is None:
-        n, m = len(search.xyz), len(search.marks.places)
-        return f"the {m} marks found do not make the pattern that the {n} points would from any side"
-    found, alike = search.likeliest(found)
-    if alike is not None:
-        return (
-            f"the points look the same from another side, or moved on, as a regular grid does: {len(found.mark)} marks "
-            f"agree with one naming, {len(alike.mark)} with another one, and about as closely"
-        )
-    return search.names(found)
-
-
-def _first(searches: Sequence["_Search"]) -> tuple["_Search", Grown | None]:
-    """Return the first accepted identification, the most significant one of several principal distances."""
-    # The clusters that need the fewest trials come first.
+    """Take the first accepted identification, the most significant one of several principal distances."""
     most = MOST_LOG10_CHANCE - np.log10(len(searches))
+    believed: list[tuple[_Search, Grown]] = []
     tried = 0
-    for cluster in searches[0].clusters:
-        believed = []
+    for cluster in searches[0].clusters:  # those that need the fewest trials come first
         for search in searches:
-            poses = search.poses(cluster.triple[None], mark_triples(cluster, search.marks))
-            tried += poses.tried
-            if (found := next(iter(search.grown(poses)), None)) is not None and found.log10_chance < most:
-                believed.append((search, found))
-        if believed:
-            return min(believed, key=lambda one: one[1].log10_chance)
-        if tried > MOST_POSES * len(searches):
+            grown, count = search.grown(cluster.triple[None], mark_triples(cluster, search.marks))
+            tried += count
+            if grown and grown[0].log10_chance < most:
+                believed.append((search, grown[0]))
+        if believed or tried > MOST_POSES * len(searches):
             break
-    return searches[0], None
+    if not believed:
+        n, m = len(searches[0].xyz), len(searches[0].marks.places)
+        return f"the {m} marks found do not make the pattern that the {n} points would from any side"
+    search, found = min(believed, key=lambda one: one[1].log10_chance)
+    others = search.others(found)
+    best = min([found, *others], key=attrgetter("log10_chance"))
+    for other in others if best is found else [found, *search.others(best)]:
+        # The number of marks alone does not decide: for a grid shifted by one step, the points lost at one end may be
+        # as many as those missed by chance.
+        closer = 2 * len(other.mark) * np.log10(other.gate / best.gate)  # likelihood of two coordinates each
+        if len(other.mark) >= ALIKE_SHARE * len(best.mark) and closer < TOLD_LOG10:
+            return (
+                f"the points look the same from another side, or moved on, as a regular grid does: {len(best.mark)} "
+                f"marks agree with one naming, {len(other.mark)} with another one, and about as closely"
+            )
+    return search.names(best)
 
 
 def _named_by_codes(searches: Sequence["_Search"], codes: Mapping[int, int]) -> Names | str:
-    grown = [(search, one) for search in searches if (one := search.grow_codes(codes)) is not None]
-    if not grown:
+    """Take the pose that most codes agree with, if its expected number of false alarms is small."""
+    coded, points = np.array(list(codes)), np.array(list(codes.values()))
+    tests = float(comb(len(codes), OF_POSE))
+    candidates = []
+    for search in searches:
+        marks = search.marks
+        if (found := resect(search.xyz[points], marks.places[coded], 1.0, marks.sigma)) is None:
+            continue
+        view, agree = View(found.pose.rotation, -found.pose.rotation @ found.pose.center), found.inliers
+        grown = grow(view, points[agree], coded[agree], search.xyz, search.normals, marks)
+        chance = min(np.pi * (2.0 * grown.gate) ** 2 / float(np.prod(marks.greatest - marks.least)), 1.0)
+        right = sum(grown.mark.get(point) == mark for mark, point in codes.items())
+        grown = replace(grown, log10_chance=log10_of_chance(right, len(codes), chance, tests))
+        candidates.append((search, grown, right))
+    if not candidates:
         return f"the {len(codes)} coded targets recognised lie on one line and do not orient the image"
-    search, best = min(grown, key=lambda one: one[1].log10_chance)
+    search, best, right = min(candidates, key=lambda one: one[1].log10_chance)
     if best.log10_chance + np.log10(len(searches)) > MOST_LOG10_CHANCE_OF_CODES:
-        right = _right_codes(best, codes)
         return f"{right} of the {len(codes)} coded targets recognised fit their points, which may be a false alarm"
     numbers = set(codes.values())
     named = {
@@ -298,11 +290,6 @@ def _named_by_codes(searches: Sequence["_Search"], codes: Mapping[int, int]) -> 
         if codes.get(mark, point) == point and (mark in codes or point not in numbers)
     }
     return search.names(replace(best, mark=named))
-
-
-def _right_codes(grown: Grown, codes: Mapping[int, int]) -> int:
-    """Number of codes that agree with an identification."""
-    return sum(grown.mark.get(point) == mark for mark, point in codes.items())
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,53 +318,22 @@ class _Search:
         of_view = pose, c * (1.0 + view.scale), view.radial
         return Names(found.mark, *of_view, found.expected, found.log10_chance, found.gate * c)
 
-    def grow_codes(self, codes: Mapping[int, int]) -> Grown | None:
-        """Grow the pose that most codes agree with, and compute its false-alarm rate; None for codes on one line."""
-        marks, coded, points = self.marks, np.array(list(codes)), np.array(list(codes.values()))
-        found = resect(self.xyz[points], marks.places[coded], 1.0, marks.sigma)
-        if found is None:
-            return None
-        view, agree = View(found.pose.rotation, -found.pose.rotation @ found.pose.center), found.inliers
-        grown = grow(view, points[agree], coded[agree], self.xyz, self.normals, marks)
-        chance = min(np.pi * (2.0 * grown.gate) ** 2 / float(np.prod(marks.greatest - marks.least)), 1.0)
-        tests = float(comb(len(codes), OF_POSE))
-        return replace(grown, log10_chance=log10_of_chance(_right_codes(grown, codes), len(codes), chance, tests))
-
-    def poses(self, points: Indices, named: Indices) -> Poses:
-        return promising(self.xyz, self.normals, self.marks, points, named)
-
-    def grown(self, poses: Poses) -> list[Grown]:
-        """Identifications of enough marks, the most significant first."""
-        grown = [
-            grow(View(rotation, shift), *named, self.xyz, self.normals, self.marks)
-            for rotation, shift, named in zip(poses.rotations, poses.shifts, poses.named, strict=True)
-        ]
+    def grown(self, points: Indices, named: Indices) -> tuple[list[Grown], int]:
+        """Identifications of enough marks, the most significant first, from three points (k or 1, 3) matched to three
+        marks (k or 1, 3); and the number of poses tried."""
+        starts, tried = promising(self.xyz, self.normals, self.marks, points, named)
+        grown = [grow(*start, self.xyz, self.normals, self.marks) for start in starts]
         enough = [one for one in grown if len(one.mark) >= LEAST_SHARE * one.expected and len(one.mark) >= LEAST_POINTS]
-        return sorted(enough, key=attrgetter("log10_chance"))
+        return sorted(enough, key=attrgetter("log10_chance")), tried
 
-    def likeliest(self, found: Grown) -> tuple[Grown, Grown | None]:
-        """Return the most significant of an identification and its alternatives, and a rival as good, if any."""
-        others = self._others(found)
-        best = min([found, *others], key=attrgetter("log10_chance"))
-        rivals = others if best is found else [found, *self._others(best)]
-        return best, next((one for one in rivals if _is_alike(one, best)), None)
-
-    def _others(self, found: Grown) -> list[Grown]:
+    def others(self, found: Grown) -> list[Grown]:
         """Alternative identifications of the image: identified clusters matched to other points."""
         named = [cluster for cluster in self.clusters if all(int(point) in found.mark for point in cluster.triple)]
         others: list[Grown] = []
         for cluster in named[:OTHER_CLUSTERS]:
             marks = np.array([[found.mark[int(point)] for point in cluster.triple]])
-            others += self.grown(self.poses(point_triples(cluster, self.xyz), marks))
+            others += self.grown(point_triples(cluster, self.xyz), marks)[0]
         return [one for one in others if len(found.mark.items() & one.mark.items()) < 0.5 * len(one.mark)]
-
-
-def _is_alike(other: Grown, best: Grown) -> bool:
-    """Whether another identification explains about as many marks about as closely."""
-    # The number of marks alone does not decide: for a grid shifted by one step, the points lost at one end may be as
-    # many as those missed by chance.
-    closer = 2 * len(other.mark) * np.log10(other.gate / best.gate)  # likelihood of two coordinates each
-    return len(other.mark) >= ALIKE_SHARE * len(best.mark) and bool(closer < TOLD_LOG10)
 
 
 def clusters(xyz: Array, normals: Array, marks_per_point: float) -> list[Cluster]:
@@ -453,8 +409,14 @@ def point_triples(cluster: Cluster, xyz: Array) -> Indices:
     return np.array(triples, dtype=np.intp).reshape(-1, 3)
 
 
-def promising(xyz: Array, normals: Array, marks: Marks, points: Indices, named: Indices) -> Poses:
-    """Find the poses that best explain the surroundings of three points (k or 1, 3) as three marks (k or 1, 3)."""
+Start = tuple["View", Indices, Indices]  # a pose, and the points about its cluster that agree with it, and their marks
+
+
+def promising(xyz: Array, normals: Array, marks: Marks, points: Indices, named: Indices) -> tuple[list[Start], int]:
+    """Find the poses that best explain the surroundings of three points (k or 1, 3) as three marks (k or 1, 3).
+
+    Returns the best ones first, and the number of poses tried.
+    """
     count = max(len(points), len(named))
     about = _nearest_points(xyz, points, _ABOUT)
     kept: list[tuple[Array, Array, Indices, Array]] = []
@@ -486,8 +448,15 @@ def promising(xyz: Array, normals: Array, marks: Marks, points: Indices, named: 
     ring = _rows(_nearest_points(xyz, points, _FARTHER), of)
     evidence, nearest, hit = _tested(rotations, shifts, xyz[ring], anchors, marks, _LATER_REACH)
     best = np.argsort(-evidence, kind="stable")[:_RETURNED]
-    agreeing = [(np.append(own[i], ring[i, hit[i]]), np.append(own_marks[i], nearest[i, hit[i]])) for i in best]
-    return Poses(rotations[best], shifts[best], agreeing, tried)
+    starts = [
+        (
+            View(rotations[i], shifts[i]),
+            np.append(own[i], ring[i, hit[i]]),
+            np.append(own_marks[i], nearest[i, hit[i]]),
+        )
+        for i in best
+    ]
+    return starts, tried
 
 
 def _rows(table: Indices, rows: Indices) -> Indices:
@@ -518,28 +487,11 @@ def _tested(
     return np.where(marks.inside(places), gain, 0.0).sum(axis=1), nearest, hit & marks.inside(places)
 
 
-def mark_density(tree: cKDTree, places: Array) -> Array:
-    """(n,) local density of marks at places (n, 2), from the distance of the k-th nearest mark."""
-    crowd = min(_CROWD, tree.n)
-    reach = np.asarray(tree.query(places, k=[crowd])[0])[:, 0]
-    return np.asarray(crowd / (np.pi * np.maximum(reach, 1e-12) ** 2))
-
-
-def chance_of_a_mark(density: Array, reach: Array | float) -> Array:
-    """Probability of a mark within reach of a place, for randomly distributed marks of a density (Poisson)."""
-    return np.asarray(-np.expm1(-density * np.pi * np.square(reach)))
-
-
-def log10_of_agreement(agreeing: int, of: int, chance: float) -> float:
-    """log10 of the binomial probability that at least `agreeing` of `of` points agree by chance."""
-    with np.errstate(divide="ignore"):  # underflow gives -inf
-        return float(np.log10(bdtrc(agreeing - 1, of, chance)))
-
-
 def grow(view: View, points: Indices, named: Indices, xyz: Array, normals: Array, marks: Marks) -> Grown:
     """Fit and identify alternately until nothing changes, from points (k,) identified as marks named (k,).
 
-    The gates follow from the covariance of the last fit.
+    The gates follow from the covariance of the last fit. Any three points matched to any three marks give a pose. The
+    others must agree, each with the probability that its gate contains a mark by chance.
     """
     sigma = marks.sigma
     for _ in range(_ROUNDS):
@@ -550,7 +502,15 @@ def grow(view: View, points: Indices, named: Indices, xyz: Array, normals: Array
         points, named = _near(view, xyz, normals, marks, sigma, covariance)
         if np.array_equal(points, before[0]) and np.array_equal(named, before[1]):
             break
-    return _significance(view, xyz, normals, marks, sigma, dict(zip(points.tolist(), named.tolist(), strict=True)))
+    gate, shown = _GATE_SIGMAS * sigma, np.flatnonzero(_shown_points(view, xyz, normals, marks))
+    agreeing = min(len(points), len(shown))
+    if agreeing <= OF_POSE:
+        return Grown(view)
+    # A pose fitted to all points may differ by the gate from that of three points: twice the gate.
+    chance = float(marks.chance(view.images(xyz[shown]), np.full(len(shown), 2.0 * gate)).mean())
+    log10_chance = log10_of_chance(agreeing, len(shown), chance, (float(len(xyz)) * len(marks.places)) ** OF_POSE)
+    mark = dict(zip(points.tolist(), named.tolist(), strict=True))
+    return Grown(view, mark, gate, len(shown), log10_chance)
 
 
 def _near(
@@ -575,7 +535,10 @@ def _near(
 
 
 def _shown_points(view: View, xyz: Array, normals: Array, marks: Marks) -> Mask:
-    return np.asarray(marks.inside(view.images(xyz)) & view.facing(xyz, normals))
+    """Mask of points inside the searched area that face the camera, or whose direction is unknown."""
+    station = -view.rotation.T @ view.shift
+    facing = ~(np.einsum("ni,ni->n", normals, station - xyz) <= 0.0)
+    return np.asarray(marks.inside(view.images(xyz)) & facing)
 
 
 def _fit_view(view: View, xyz: Array, places: Array, marks: Marks) -> tuple[View, float, Array]:
@@ -598,7 +561,9 @@ def _fit_view(view: View, xyz: Array, places: Array, marks: Marks) -> tuple[View
         right -= priors @ np.array([0.0] * 6 + [view.scale, view.radial])
         scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-30))
         step = scale * np.linalg.lstsq(normal * np.outer(scale, scale), scale * right, rcond=1e-13)[0]
-        view = view.stepped(step)
+        turn = rotation_from_vector(step[:3])
+        shift = turn @ view.shift + step[3:6]
+        view = View(turn @ view.rotation, shift, view.scale + step[6], view.radial + step[7])
         if np.abs(by @ step).max() < 0.01 * sigma:
             break
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-30))
@@ -606,25 +571,11 @@ def _fit_view(view: View, xyz: Array, places: Array, marks: Marks) -> tuple[View
     return view, sigma, covariance
 
 
-def _significance(view: View, xyz: Array, normals: Array, marks: Marks, sigma: float, mark: dict[int, int]) -> Grown:
-    """Compute the expected number of false alarms of an identification."""
-    # Any three points matched to any three marks give a pose. The others must agree, each with the probability that its
-    # gate contains a mark by chance.
-    gate = _GATE_SIGMAS * sigma
-    shown = np.flatnonzero(_shown_points(view, xyz, normals, marks))
-    expected = len(shown)
-    agreeing = min(len(mark), expected)
-    if agreeing <= OF_POSE:
-        return Grown(view)
-    # A pose fitted to all points may differ by the gate from that of three points: twice the gate.
-    chance = float(marks.chance(view.images(xyz[shown]), np.full(expected, 2.0 * gate)).mean())
-    tests = (float(len(xyz)) * len(marks.places)) ** OF_POSE
-    return Grown(view, mark, gate, expected, log10_of_chance(agreeing, expected, chance, tests))
-
-
 def log10_of_chance(agreeing: int, expected: int, chance: float, tests: float) -> float:
-    """log10 of the expected number of poses with so many agreeing points under the null hypothesis.
+    """log10 of the expected number of poses with so many agreeing points under the null hypothesis (binomial).
 
     Three of the points always agree, with up to four poses for each of the possible tests.
     """
-    return log10_of_agreement(agreeing - OF_POSE, expected - OF_POSE, chance) + float(np.log10(4.0 * tests))
+    with np.errstate(divide="ignore"):  # underflow gives -inf
+        of_pose = float(np.log10(bdtrc(agreeing - OF_POSE - 1, expected - OF_POSE, chance)))
+    return of_pose + float(np.log10(4.0 * tests))
