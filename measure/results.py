@@ -221,25 +221,22 @@ class FrameMeasurement:
 
 def moved_frame(frame: FrameMeasurement, shift_px: Array) -> FrameMeasurement:
     """Shift all places of a frame by (2,) column and row, for another pixel origin."""
+    right, down = shift_px.tolist()
+    marks, lines, matrix = [], [], frame.pixel_from_camera
+    for mark in frame.marks:
+        places = {"junction_col_px": right, "junction_row_px": down}
+        quality = {key: value + places.get(key, 0.0) for key, value in mark.quality.items()}
+        center_px = None if mark.center_px is None else mark.center_px + shift_px
+        marks.append(replace(mark, center_px=center_px, quality=quality))
+    for line in frame.writing or ():
+        outline_px = tuple((col + right, row + down) for col, row in line.outline_px)
+        lines.append(replace(line, outline_px=outline_px))
     return replace(
         frame,
-        marks=tuple(_moved_mark(mark, shift_px) for mark in frame.marks),
-        pixel_from_camera=None
-        if frame.pixel_from_camera is None
-        else frame.pixel_from_camera + np.column_stack([np.zeros((2, 2)), shift_px]),
-        writing=None if frame.writing is None else tuple(_moved_line(line, shift_px) for line in frame.writing),
+        marks=tuple(marks),
+        pixel_from_camera=None if matrix is None else matrix + np.column_stack([np.zeros((2, 2)), shift_px]),
+        writing=None if frame.writing is None else tuple(lines),
     )
-
-
-def _moved_mark(mark: MarkMeasurement, shift_px: Array) -> MarkMeasurement:
-    places = {"junction_col_px": shift_px[0], "junction_row_px": shift_px[1]}
-    quality = {key: value + places.get(key, 0.0) for key, value in mark.quality.items()}
-    return replace(mark, center_px=None if mark.center_px is None else mark.center_px + shift_px, quality=quality)
-
-
-def _moved_line(line: Line, shift_px: Array) -> Line:
-    outline = tuple((col + float(shift_px[0]), row + float(shift_px[1])) for col, row in line.outline_px)
-    return replace(line, outline_px=outline)
 
 
 @dataclass(frozen=True, eq=False)

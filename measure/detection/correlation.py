@@ -62,26 +62,21 @@ class Surroundings:
         return np.clip(detail, -_CLIP, _CLIP, out=detail)
 
     def pattern(self, template: Array, detail_px: float, image: Map) -> tuple[Map, Map]:
-        """Convert a template to the zero-mean pattern correlated with a flattened image, and its mask; nan pixels of
-        the template are masked."""
-        about = self._template_mask(template, detail_px)
+        """Convert a template to the zero-mean pattern correlated with a flattened image, and its mask: 1 on the drawing
+        and around it, or on all known pixels if the template has no known rim; 0 elsewhere and for nan pixels."""
+        about = ~np.isnan(template)
+        rim = np.concatenate([template[0], template[-1], template[:, 0], template[:, -1]])
+        if not np.isnan(rim).all():  # only the drawing and its surroundings
+            drawn = np.nan_to_num(np.abs(template - np.nanmedian(rim)))
+            # A line far thinner than a pixel has almost no contrast left.
+            background = (drawn < min(_DRAWN, float(drawn.max()) / 2)).astype(np.uint8)
+            about &= cv2.distanceTransform(background, cv2.DIST_L2, 5) <= self.beside * detail_px + 1
+        mask = np.asarray(about, np.float32)
         template = np.nan_to_num(template)
         chip = np.asarray(template - cv2.GaussianBlur(template, (0, 0), self.coarse * detail_px), np.float32)
         if self.whitened:
             chip = np.asarray(cv2.filter2D(chip, -1, _inverse_covariance(image)), np.float32)
-        return about * (chip - np.average(chip, weights=about)), about
-
-    def _template_mask(self, template: Array, detail_px: float) -> Map:
-        """1 on the drawing and around it, 0 elsewhere; 1 on all known pixels if the template has no known rim."""
-        rim = np.concatenate([template[0], template[-1], template[:, 0], template[:, -1]])
-        if np.isnan(rim).all():
-            return np.asarray(~np.isnan(template), np.float32)
-        drawn = np.nan_to_num(np.abs(template - np.nanmedian(rim)))
-        # A line far thinner than a pixel has almost no contrast left.
-        background = (drawn < min(_DRAWN, float(drawn.max()) / 2)).astype(np.uint8)
-        far_px = self.beside * detail_px + 1
-        near = cv2.distanceTransform(background, cv2.DIST_L2, 5) <= far_px
-        return np.asarray(near & ~np.isnan(template), np.float32)
+        return mask * (chip - np.average(chip, weights=mask)), mask
 
 
 def variation(image: Map, about: Map) -> Map:

@@ -9,15 +9,13 @@ import numpy as np
 from scipy import fft
 from scipy.special import ndtr
 
-from measure.array_types import Array, Single
+from measure.array_types import Array
 from measure.detection.correlation import WIDE, Surroundings, correlation, highest_about
 from measure.flags import NOISE_LIKE_A_MARK
 from measure.marks.rendering import detail_px, extent_px, known_picture, mark_window
 from measure.marks.shapes import Mark
 from measure.matching.window import FAINT
 from measure.scans.scan import Scan
-
-Map = Single
 
 _SURE = 1e-6  # false alarms below which no softer template is tried; small, since there are many marks
 _HALVED_PX = 6.0  # px, width of the finest line from which on half the resolution suffices

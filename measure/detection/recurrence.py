@@ -64,20 +64,16 @@ def recurrence(reference: Window, others: Sequence[Window], size_mm: float) -> R
     best = int(np.argmax(excess))
     row, col = tried[best]
     square = reference[row : row + _SIDE, col : col + _SIDE]
-    places = [_highest(cv2.matchTemplate(window, square, cv2.TM_CCOEFF_NORMED)) for window in others]
-    moved = [
-        _shift_window(window, col - there[1], row - there[0]) for window, there in zip(others, places, strict=True)
-    ]
-    center_row, center_col = _telling(np.stack([reference, *moved]), (row, col))
+    aligned = [reference]
+    for window in others:
+        own_row, own_col = _highest(cv2.matchTemplate(window, square, cv2.TM_CCOEFF_NORMED))
+        shift = np.array([[1.0, 0.0, col - own_col], [0.0, 1.0, row - own_row]], np.float32)
+        moved = cv2.warpAffine(window, shift, window.shape[::-1], flags=cv2.INTER_NEAREST)
+        aligned.append(np.asarray(moved, np.float32))
+    center_row, center_col = _telling(np.stack(aligned), (row, col))
     middle = (reference.shape[0] - 1) / 2
     offset = np.array([center_col - middle, middle - center_row]) * size_mm / _SIDE
     return Recurrence(offset, float(excess[best]))
-
-
-def _shift_window(window: Window, right: int, down: int) -> Window:
-    """Shift a window by whole samples, filling with zeros."""
-    shift = np.array([[1.0, 0.0, right], [0.0, 1.0, down]], np.float32)
-    return np.asarray(cv2.warpAffine(window, shift, window.shape[::-1], flags=cv2.INTER_NEAREST), np.float32)
 
 
 def _telling(stack: Window, square: tuple[int, int]) -> tuple[int, int]:
@@ -98,17 +94,17 @@ def _telling(stack: Window, square: tuple[int, int]) -> tuple[int, int]:
 
 
 def _excess(square: Window, windows: Sequence[Window]) -> float:
+    """NCC of the best match in a window minus that of the second best, median over the windows."""
     if square.std() < 1e-3:
         return 0.0
-    return float(np.median([_best_less_second(cv2.matchTemplate(w, square, cv2.TM_CCOEFF_NORMED)) for w in windows]))
-
-
-def _best_less_second(response: NDArray[np.generic]) -> float:
-    row, col = _highest(response)
-    rest = np.array(response, np.float32)
-    best = float(rest[row, col])
-    rest[max(row - _APART, 0) : row + _APART + 1, max(col - _APART, 0) : col + _APART + 1] = -1.0
-    return best - max(float(rest.max()), 0.0)
+    excesses = []
+    for window in windows:
+        rest = np.array(cv2.matchTemplate(window, square, cv2.TM_CCOEFF_NORMED), np.float32)
+        row, col = _highest(rest)
+        best = float(rest[row, col])
+        rest[max(row - _APART, 0) : row + _APART + 1, max(col - _APART, 0) : col + _APART + 1] = -1.0
+        excesses.append(best - max(float(rest.max()), 0.0))
+    return float(np.median(excesses))
 
 
 def _highest(response: NDArray[np.generic]) -> tuple[int, int]:

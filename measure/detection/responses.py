@@ -35,19 +35,12 @@ _LEARNED = 2.0  # in widths of the finest detail: wide notches and blocks would 
 _GRID_PX = 16  # px of the reduced scan: places in one cell of this grid share a window
 _LEAST_RESPONSE = 0.2  # smallest NCC of a candidate
 _CANDIDATES = 100  # largest number per template
-_NARROWED = 0.7  # factor of the tolerance for refined placements
-LEAST_TOLERANCE_PX = 1.5  # px of the reduced scan, accuracy of correlation peaks
 _BACKGROUND_PERCENT = 95  # percentile of the NCC that defines the background's response
 _LEAST_BACKGROUND = 0.5  # fraction of the map taken for background at least
 _SAMPLED = slice(None, None, 3)  # subsampling for that estimate, since neighbours are correlated
 _MOST_CACHED = 768 << 20  # bytes, enough for four different marks in a large scan
 _SMALL_MAPS = 32  # maps of a small scan at full resolution
 _LEAST_CACHED = 32 << 20  # bytes
-
-
-def narrow_tolerance_px(tolerance_px: float) -> float:
-    """Tolerance of a refined placement."""
-    return max(_NARROWED * tolerance_px, LEAST_TOLERANCE_PX)
 
 
 @dataclass(frozen=True)
@@ -128,7 +121,10 @@ class Templates:
                 first.append(number)
             kind_by_id[id(image)] = int(correlations[number, first].argmax())
         kinds = tuple(kind_by_id[id(image)] for image in images)
-        details = [_ground_detail_px(views[kinds.index(kind)], reduction) for kind in range(len(first))]
+        details = []
+        for view in (views[kinds.index(kind)] for kind in range(len(first))):
+            wide = _LEARNED if isinstance(view.mark, MarkTemplate) else 1.0
+            details.append(max(wide * detail_px(view.mark, view.linear) / reduction, 1.0))
         return cls([own[number] for number in first], details, kinds, reduction)
 
     @property
@@ -148,12 +144,6 @@ def _search_reduction(scan: Scan, views: Sequence[MarkView]) -> int:
     return min(max(1, int(min(limits)), int(np.ceil(needed))), scan.width_px, scan.height_px)
 
 
-def _ground_detail_px(view: MarkView, reduction: int) -> float:
-    """Width of the structure that is not background, px of the reduced scan: the finest detail, more for a template."""
-    wide = _LEARNED if isinstance(view.mark, MarkTemplate) else 1.0
-    return max(wide * detail_px(view.mark, view.linear) / reduction, 1.0)
-
-
 def _images(views: Sequence[MarkView], reduction: int, half_px: int) -> list[Array]:
     """Templates of views. Equal marks in the same direction share one; quarter turns and mirroring reuse it turned."""
     first: dict[Mark, tuple[Array, Array]] = {}
@@ -166,13 +156,10 @@ def _images(views: Sequence[MarkView], reduction: int, half_px: int) -> list[Arr
             first[view.mark] = view.linear, _image(view, reduction, half_px)
         linear, image = first[view.mark]
         turn = view.linear @ np.linalg.inv(linear)
-        drawn[key] = turn_by_quarters(image, turn) if _is_quarter(turn) else _image(view, reduction, half_px)
+        whole = np.rint(turn)
+        is_quarter = np.allclose(turn, whole, atol=1e-9) and np.array_equal(np.abs(whole).sum(axis=0), [1, 1])
+        drawn[key] = turn_by_quarters(image, turn) if is_quarter else _image(view, reduction, half_px)
     return [drawn[view.mark, view.linear.tobytes()] for view in views]
-
-
-def _is_quarter(turn: Array) -> bool:
-    whole = np.rint(turn)
-    return bool(np.allclose(turn, whole, atol=1e-9) and np.array_equal(np.abs(whole).sum(axis=0), [1, 1]))
 
 
 def _image(view: MarkView, reduction: int, half_px: int) -> Array:

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from measure.array_types import Array
 from measure.detection.correlation import WIDE, Surroundings
-from measure.detection.responses import LEAST_TOLERANCE_PX, Key, Responses, narrow_tolerance_px
+from measure.detection.responses import Key, Responses
 from measure.fiducials.interior_orientation import FilmFit
 from measure.fiducials.options import TakingLens
 from measure.geometry import UP_FROM_CAMERA, Affine, linear_scale
@@ -35,6 +35,8 @@ _SAME_SIZE = 0.01  # relative difference of scale up to which they are: 10 px at
 _SAME = 0.1  # fraction of the tolerance: orientations whose marks coincide so closely share their placements
 _OUTSIDE_COST = 0.1  # score subtracted for each mark outside the scan
 _STEP_MM = 0.01  # mm, step of numerical derivatives
+_NARROWED = 0.7  # factor of the tolerance for refined placements
+_LEAST_TOLERANCE_PX = 1.5  # px of the reduced scan, accuracy of correlation peaks
 
 
 class Bounds(NamedTuple):
@@ -213,7 +215,7 @@ class PlacementSearch:
         self.marks, self.responses, self.bounds, self.lens = marks, responses, bounds, lens
         self.camera_mm = np.array([mark.xy_mm for mark in marks])
         self.pitch_mm, self.pitch = pitch_mm, np.asarray(pitch_mm)
-        self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, LEAST_TOLERANCE_PX)
+        self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, _LEAST_TOLERANCE_PX)
         self.kinds: dict[str, tuple[int, ...]] = {}
         self.placements: dict[str, list[Placement]] = {}
         self.distinct: list[str] = []
@@ -278,7 +280,7 @@ class _Constellation:
         kept = np.argsort(-scores, kind="stable")[:_KEPT]
         stepped = self._step_along_lattice(scale[kept[:_STEPPED]], offset[kept[:_STEPPED]])
         scale, offset = self._refined(np.append(scale[kept], stepped[0]), np.append(offset[kept], stepped[1]))
-        scores, supported = self._scores(narrow_tolerance_px(search.tolerance_px), scale, offset)
+        scores, supported = self._scores(_narrow_tolerance_px(search.tolerance_px), scale, offset)
         per_mm = np.array([1.0, -1.0])[:, None] / search.pitch[:, None]
         settings = polarity, self.responses.reduction, search.pitch_mm, self.responses.surroundings, search.lens
         return [
@@ -351,7 +353,7 @@ class _Constellation:
         widest = self.search.tolerance_px
         scale, offset = scale.copy(), offset.copy()
         moving = np.ones(len(scale), dtype=bool)
-        for tolerance_px in (widest, narrow_tolerance_px(widest)):
+        for tolerance_px in (widest, _narrow_tolerance_px(widest)):
             predicted = self._reduced_px(scale, offset)
             found = [
                 self.responses.highest_about(key, predicted[:, mark], tolerance_px)
@@ -362,3 +364,8 @@ class _Constellation:
             moving &= (weight > 0).sum(axis=1) >= 2
             scale[moving], offset[moving] = _fit_similarity(self.camera, self._complex(tops[moving]), weight[moving])
         return scale, offset
+
+
+def _narrow_tolerance_px(tolerance_px: float) -> float:
+    """Tolerance of a refined placement."""
+    return max(_NARROWED * tolerance_px, _LEAST_TOLERANCE_PX)

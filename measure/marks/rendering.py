@@ -6,7 +6,7 @@ sufficiently many corners. By Green's theorem, the area of a part in each pixel 
 the pixels left of it.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -81,10 +81,8 @@ def render(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px:
     A drawn mark is 1 inside and 0 outside. A chip spans 0 to 1 and is blurred in addition to its own blur.
     pixel_from_mark: (2, 3), from (x_mm, y_mm, 1) to (col, row) of the window.
     """
-    value, by_col, by_row, by_col_col, by_col_row, by_row_row = _blurred_derivatives(
-        mark, pixel_from_mark, (width, height), blur_px, ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-    )
-    return Rendering(value, by_col, by_row, by_col_col, by_col_row, by_row_row)
+    orders = (0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)
+    return Rendering(*_blurred_derivatives(mark, pixel_from_mark, (width, height), blur_px, orders))
 
 
 def picture(mark: Mark, pixel_from_mark: Array, width: int, height: int, blur_px: float, cells: int = CELLS) -> Array:
@@ -358,43 +356,22 @@ def cell_coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: 
     cell_from_mark = np.array(pixel_from_mark, dtype=float)
     cell_from_mark[:, 2] += 0.5
     cell_from_mark *= cells  # corners of cells are whole numbers
-    covered = np.zeros((height * cells, width * cells), np.float32)
-    for pieces in _outline_pieces(shape, cell_from_mark):
-        _add(covered, pieces)
-    return covered
-
-
-@dataclass(frozen=True, eq=False)
-class _Pieces:
-    """Outline of a part, cut into n pieces, each within one cell. row, col: (n,) of the cell; tall: (n,) height,
-    positive downwards; middle: (n,) column of the centre."""
-
-    row: Indices
-    col: Indices
-    tall: Array
-    middle: Array
-
-
-def _outline_pieces(shape: MarkShape, cell_from_mark: Array) -> Iterator[_Pieces]:
-    """Cut the outlines of all parts at the cell borders, in one pass; yields the pieces of each part."""
-    parts = shape.parts
-    outlines = [_outlines(part, cell_from_mark) for part in parts]
+    outlines = [_outlines(part, cell_from_mark) for part in shape.parts]
     corners = np.concatenate([outline for own in outlines for outline in own])
     ends = np.concatenate([np.roll(outline, -1, axis=0) for own in outlines for outline in own])
-    part_of = np.repeat(np.arange(len(parts)), [sum(map(len, own)) for own in outlines])
-    linear, shift = cell_from_mark[:, :2].T, cell_from_mark[:, 2]
-    start, end, part_of = _split(
-        shape.perspective_places(corners) @ linear + shift,
-        shape.perspective_places(ends) @ linear + shift,
-        part_of,
-        axis=1,
+    part_of = np.repeat(np.arange(len(outlines)), [sum(map(len, own)) for own in outlines])
+    start, end = (
+        shape.perspective_places(places) @ cell_from_mark[:, :2].T + cell_from_mark[:, 2] for places in (corners, ends)
     )
-    start, end, part_of = _split(start, end, part_of, axis=0)
+    for axis in (1, 0):  # cut at the cell borders: each piece lies within one cell
+        start, end, part_of = _split(start, end, part_of, axis)
     tall, middle = end[:, 1] - start[:, 1], (start + end) / 2
     col, row = np.floor(middle).astype(np.intp).T
-    bounds = np.searchsorted(part_of, np.arange(len(parts) + 1)).tolist()
+    covered = np.zeros((height * cells, width * cells), np.float32)
+    bounds = np.searchsorted(part_of, np.arange(len(outlines) + 1)).tolist()
     for own in (slice(*pair) for pair in pairwise(bounds)):
-        yield _Pieces(row[own], col[own], tall[own], middle[own, 0])
+        _add(covered, row[own], col[own], tall[own], middle[own, 0])
+    return covered
 
 
 def _outlines(part: Part, cell_from_mark: Array) -> list[Array]:
@@ -442,16 +419,21 @@ def _split(start: Array, end: Array, part_of: Indices, axis: int) -> tuple[Array
     return cut, cut_end, part_of[line]
 
 
-def _add(covered: Single, pieces: _Pieces) -> None:
+def _add(covered: Single, row: Indices, col: Indices, tall: Array, middle: Array) -> None:
     """Add a part to the coverage, by Green's theorem. Each piece of its outline adds its height to all cells right of
-    it and, in its own cell, the area right of it. Only cells in the part's bounding box are processed."""
+    it and, in its own cell, the area right of it. Only cells in the part's bounding box are processed.
+
+    row, col : (n,) cell of each piece; tall : (n,) height, positive downwards; middle : (n,) column of the centre.
+    """
     height, width = covered.shape
-    inside = (pieces.row >= 0) & (pieces.row < height) & (pieces.col < width)
+    inside = (row >= 0) & (row < height) & (col < width)
     if not inside.any():
         return
-    row, col, tall = pieces.row[inside], np.maximum(pieces.col[inside], 0), pieces.tall[inside]
-    own = tall * np.where(pieces.col[inside] < 0, 1.0, col + 1 - pieces.middle[inside])
-    row0, col0, col1 = row.min(), col.min(), min(pieces.col.max() + 1, width)
+    col1 = min(col.max() + 1, width)
+    row, col, tall, middle = row[inside], col[inside], tall[inside], middle[inside]
+    own = tall * np.where(col < 0, 1.0, col + 1 - middle)
+    col = np.maximum(col, 0)
+    row0, col0 = row.min(), col.min()
     tall_cells, wide_cells = row.max() - row0 + 1, col1 - col0 + 1
     cell = (row - row0) * wide_cells + col - col0
     count = tall_cells * wide_cells

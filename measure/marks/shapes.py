@@ -6,7 +6,7 @@ The kinds (cross, dot, ...) are shorthands that return parts; all other modules 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal, TypeGuard
+from typing import ClassVar, Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -347,17 +347,15 @@ def finest_detail_mm(mark: Mark) -> float:
     """Width of the mark's thinnest line, or length of the shortest straight edge between corners of its outline."""
     if isinstance(mark, MarkTemplate):
         return mark.thinnest_mm
-    outlines = (np.asarray(part.vertices_mm) for part in mark.parts if isinstance(part, Polygon))
-    return min([mark.thinnest_mm, *(length for outline in outlines for length in _straight_edges_mm(outline))])
-
-
-def _straight_edges_mm(outline: Array) -> list[float]:
-    """Lengths of the edges of a polygon (n, 2) between two corners, excluding the edges of arcs."""
-    edges = np.roll(outline, -1, axis=0) - outline
-    angles = np.angle(edges @ (1, 1j))
-    turns = np.abs(np.angle(np.exp(1j * (angles - np.roll(angles, 1)))))  # at the start of each edge
-    is_corner = turns > _CORNER_RAD
-    return [float(np.hypot(*edge)) for edge in edges[is_corner & np.roll(is_corner, -1)]]
+    finest_mm = mark.thinnest_mm
+    for outline in (np.asarray(part.vertices_mm) for part in mark.parts if isinstance(part, Polygon)):
+        edges = np.roll(outline, -1, axis=0) - outline
+        angles = np.angle(edges @ (1, 1j))
+        turns = np.abs(np.angle(np.exp(1j * (angles - np.roll(angles, 1)))))  # at the start of each edge
+        is_corner = turns > _CORNER_RAD
+        straight = edges[is_corner & np.roll(is_corner, -1)]  # without the edges of arcs
+        finest_mm = min([finest_mm, *(float(np.hypot(*edge)) for edge in straight)])
+    return finest_mm
 
 
 # Known part of a mark's drawing, at the border of the exposed frame and along the lines of a réseau.
@@ -389,27 +387,23 @@ def limit_to_crossings(layout: FiducialLayout) -> FiducialLayout:
     if len(layout.marks) < 2:
         return layout
     xy = np.array([mark.xy_mm for mark in layout.marks])
-    next_mm = np.asarray(cKDTree(xy).query(xy, k=2)[0])[:, 1]
-    return replace(
-        layout, marks=tuple(_limit_cross(mark, float(mm)) for mark, mm in zip(layout.marks, next_mm, strict=True))
-    )
-
-
-def _limit_cross(mark: LayoutMark, next_mm: float) -> LayoutMark:
-    shape = mark.mark
-    if not isinstance(shape, MarkShape) or shape.known_mm is not None:
-        return mark
-    bars = [part for part in shape.parts if isinstance(part, Bar)]
-    half_mm = _LINE_WIDTHS * max((bar.line_mm for bar in bars), default=0.0)
-    reach_mm = float(np.abs(drawn_outline_mm(shape)).max())
-    if len(bars) < len(shape.parts) or reach_mm < max(_TO_NEXT * next_mm, half_mm):
-        return mark
-    return replace(mark, mark=replace(shape, known_mm=((-half_mm, -half_mm), (half_mm, half_mm))))
+    marks = []
+    for mark, next_mm in zip(layout.marks, np.asarray(cKDTree(xy).query(xy, k=2)[0])[:, 1], strict=True):
+        shape = mark.mark
+        if isinstance(shape, MarkShape) and shape.is_cross:
+            half_mm = _LINE_WIDTHS * max(part.line_mm for part in shape.parts if isinstance(part, Bar))
+            if np.abs(drawn_outline_mm(shape)).max() >= max(_TO_NEXT * next_mm, half_mm):
+                limited = replace(shape, known_mm=((-half_mm, -half_mm), (half_mm, half_mm)))
+                mark = replace(mark, mark=limited)
+        marks.append(mark)
+    return replace(layout, marks=tuple(marks))
 
 
 def _limit_mark(mark: LayoutMark, half_mm: Array) -> LayoutMark:
     shape, at = mark.mark, np.array(mark.xy_mm)
-    if not _is_of_polygons(shape):
+    if not isinstance(shape, MarkShape) or isinstance(shape, FrameCorner):
+        return mark
+    if not all(isinstance(part, Polygon) for part in shape.parts):
         return mark
     drawn = at + drawn_outline_mm(shape)
     beyond = np.abs(at) >= half_mm - _EDGE_MM
@@ -427,12 +421,6 @@ def _limit_mark(mark: LayoutMark, half_mm: Array) -> LayoutMark:
         return mark
     (left, bottom), (right, top) = (least - at).tolist(), (greatest - at).tolist()
     return replace(mark, mark=replace(shape, known_mm=((left, bottom), (right, top))))
-
-
-def _is_of_polygons(mark: Mark) -> TypeGuard[MarkShape]:
-    if not isinstance(mark, MarkShape) or isinstance(mark, FrameCorner):
-        return False
-    return all(isinstance(part, Polygon) for part in mark.parts)
 
 
 def outline_mm(part: Part) -> Array:

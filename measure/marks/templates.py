@@ -92,7 +92,11 @@ class SharedPicture:
 
 def first_picture(stack: Array) -> SharedPicture:
     """Initial shared image of images (n, side, side), under the assumption that they are alike."""
-    levelled = [_line(picture, stack[0]) for picture in stack]
+    like, levelled = stack[0], []
+    for picture in stack:  # gain and offset by linear regression
+        off = picture - picture.mean()
+        gain = float((off * like).sum()) / max(float((off**2).sum()), 1e-12)
+        levelled.append(like.mean() + gain * off)
     return SharedPicture(
         np.median(levelled, axis=0),
         np.zeros(len(stack)),
@@ -109,8 +113,14 @@ def adjust_picture(shared: SharedPicture, stack: Array, steady: Mask) -> SharedP
     smoothed = _blur_images(stack, np.full(len(stack), SMOOTHED_PX2))
     designs = _designs(shared.image, shared.variances_px2, steady)
     fits = [_fit(*each) for each in zip(smoothed, designs, shared.weights, strict=True)]
-    alike, weights = np.array([fit.alike for fit in fits]), _weights(fits, shared.shares)
-    variances = _excess_variances(shared.variances_px2, fits)
+    alike = np.array([fit.alike for fit in fits])
+    # The share of an image in the shared one lowers its residuals. With at least the median noise no image dominates.
+    noise = np.array([fit.scale for fit in fits]) / np.sqrt(np.maximum(1 - shared.shares, _LEAST_REDUNDANCY))
+    weights = (alike + _LEAST_WEIGHT) / np.maximum(noise, np.median(noise))[:, None, None] ** 2
+    # Blurs are relative to that of the sharpest image; images not significantly less sharp have none.
+    found = _bounded(shared.variances_px2, np.array([fit.blur_px2 for fit in fits]))
+    sharpest = float((found + _SURELY * np.array([fit.blur_sigma_px2 for fit in fits])).min())
+    variances = np.maximum(found - sharpest, 0.0)
     together = _Together(shared.image, variances, weights, steady)
     image, more = together.solved(np.array([fit.levelled for fit in fits]))
     moves = np.clip(-more[:, [_COL, _ROW]], -_LONGEST_PX, _LONGEST_PX)
@@ -193,22 +203,6 @@ def _fit(picture: Array, design: Array, weights: Array) -> _Fit:
     )
 
 
-def _weights(fits: Sequence[_Fit], shares: Array) -> Array:
-    """(n, side, side) weights of the pixels. shares (n,): of the images in the shared one, by which the residuals
-    underestimate the noise. The noise is at least the median, so that no image dominates."""
-    noise = np.array([fit.scale for fit in fits]) / np.sqrt(np.maximum(1 - shares, _LEAST_REDUNDANCY))
-    noise = np.maximum(noise, np.median(noise))
-    return (np.array([fit.alike for fit in fits]) + _LEAST_WEIGHT) / noise[:, None, None] ** 2
-
-
-def _excess_variances(variances_px2: Array, fits: Sequence[_Fit]) -> Array:
-    """(n,) variances of the fits minus that of the sharpest image, plus its uncertainty; 0 for images not
-    significantly less sharp."""
-    found = _bounded(variances_px2, np.array([fit.blur_px2 for fit in fits]))
-    sharpest = float((found + _SURELY * np.array([fit.blur_sigma_px2 for fit in fits])).min())
-    return np.maximum(found - sharpest, 0.0)
-
-
 def _bounded(variances_px2: Array, change_px2: Array) -> Array:
     """Apply a change of variances, limited to the range of the linearisation."""
     total = variances_px2 + _SEEN_PX2
@@ -268,13 +262,6 @@ class _Together:
         return np.concatenate([image.ravel(), factors.ravel()])
 
 
-def _line(picture: Array, like: Array) -> Array:
-    """Fit an image to another one by gain and offset."""
-    off = picture - picture.mean()
-    gain = float((off * like).sum()) / max(float((off**2).sum()), 1e-12)
-    return np.asarray(like.mean() + gain * off)
-
-
 @dataclass(frozen=True, eq=False)
 class Chip:
     """Window of a scan around one mark.
@@ -311,13 +298,19 @@ def learn_template(chips: Sequence[Chip], size_mm: float) -> MarkTemplate:
     side = 2 * int(np.ceil(size_mm * 500 / pitch_um)) + 1  # odd: the origin is the middle pixel
     shared, steady = _align_chips(chips, side, pitch_um)
     image = shared.image
+    # The finest detail: twice the blur that halves the image's variance, the width of a single line.
+    blurs = np.arange(1.0, max(side / 4, 2.0), 0.5)
+    left = [cv2.GaussianBlur(image, (0, 0), blur).var() / max(image.var(), 1e-12) for blur in blurs]
+    detail_px = 2 * float(np.interp(-0.5, -np.array(left), blurs))
+    # Thin lines pass the high-pass filter, too, but are few.
+    noise_dn = [robust_scale(chip.grey - cv2.GaussianBlur(chip.grey, (0, 0), 2 * GRAIN_PX)) for chip in chips]
     return MarkTemplate(
         image,
         pitch_um,
         (side // 2, side // 2),
         polarity="light",  # as the chip shows it
-        detail_mm=_detail_px(image) * pitch_um / 1000,
-        noise_dn=float(np.median([_noise_dn(chip.grey) for chip in chips])),
+        detail_mm=detail_px * pitch_um / 1000,
+        noise_dn=float(np.median(noise_dn)),
         slope_noise_dn=shared.slope_noise,
         shares={chip.scan: float(share) for chip, share in zip(chips, shared.shares, strict=True)},
         steady=steady,
@@ -365,19 +358,6 @@ def _steadiness(residuals: Array, image: Array, steady: Mask) -> Array:
     return np.asarray(noise / np.maximum(about, noise))
 
 
-def _noise_dn(grey: Array) -> float:
-    """Standard deviation of one pixel's noise, from high-pass filtered grey values; thin lines pass the filter, too,
-    but are few."""
-    return robust_scale(grey - cv2.GaussianBlur(grey, (0, 0), 2 * GRAIN_PX))
-
-
-def _detail_px(image: Array) -> float:
-    """Width (px) of the finest detail: twice the blur that halves the image's variance, the width of a single line."""
-    blurs = np.arange(1.0, max(image.shape[0] / 4, 2.0), 0.5)
-    left = [cv2.GaussianBlur(image, (0, 0), blur).var() / max(image.var(), 1e-12) for blur in blurs]
-    return 2 * float(np.interp(-0.5, -np.array(left), blurs))
-
-
 # Consistent origins of learned marks that look alike in several scan orientations.
 #
 # The origin of a learned mark is a convention. In another scan orientation a mark may be confused with one that looks
@@ -401,12 +381,16 @@ def share_origins(
     another; the shifts of the origins, mm (n, 2), in the camera's axes.
     """
     count, rows, shifts, alike = len(templates), list[Array](), list[Array](), list[str]()
+    near_mm = max(template.learned_mm for template in templates)
     for pose in (pose for pose in POSES[1:] if pose in poses):
         turn = UP_FROM_CAMERA[pose]
-        to = _partners(places_mm, turn, max(template.learned_mm for template in templates))
-        pairs = [] if to is None else [_aligned_origin(templates[k], templates[to[k]], turn) for k in range(count)]
+        apart = np.hypot(*np.moveaxis((places_mm @ turn.T)[:, None] - places_mm[None], -1, 0))
+        to = apart.argmin(axis=1).tolist()  # mark to whose place the turn takes each mark
+        if apart.min(axis=1).max() >= near_mm or len(set(to)) < count:
+            continue
+        pairs = (_aligned_origin(templates[k], templates[to[k]], turn) for k in range(count))
         found = [pair for pair in pairs if pair is not None]
-        if to is None or len(found) < count:
+        if len(found) < count:
             continue
         alike.append(pose)
         for k, shift in enumerate(found):
@@ -418,15 +402,11 @@ def share_origins(
     if not alike:
         return list(templates), np.zeros((count, 2))
     moves = np.linalg.lstsq(np.concatenate(rows), np.concatenate(shifts), rcond=None)[0].reshape(count, 2)
-    moved = [_move_origin(template, move, tuple(alike)) for template, move in zip(templates, moves, strict=True)]
+    moved = []
+    for template, move in zip(templates, moves, strict=True):
+        col, row = np.array(template.origin_px) + _FLIP @ move * 1000 / template.pitch_um
+        moved.append(replace(template, origin_px=(float(col), float(row)), alike=tuple(alike)))
     return moved, moves
-
-
-def _partners(places_mm: Array, turn: Array, near_mm: float) -> list[int] | None:
-    """Index of the mark to whose place a turn takes each mark; None if any has no partner."""
-    apart = np.hypot(*np.moveaxis((places_mm @ turn.T)[:, None] - places_mm[None], -1, 0))
-    to = apart.argmin(axis=1)
-    return to.tolist() if apart.min(axis=1).max() < near_mm and len(set(to.tolist())) == len(to) else None
 
 
 def _aligned_origin(one: MarkTemplate, other: MarkTemplate, turn: Array) -> Array | None:
@@ -462,8 +442,3 @@ def _centre_origin(template: MarkTemplate) -> Array:
 def _middle(picture: Array, side: int) -> Single:
     spare = (len(picture) - side) // 2
     return np.ascontiguousarray(picture[spare : spare + side, spare : spare + side], np.float32)
-
-
-def _move_origin(template: MarkTemplate, move_mm: Array, alike: tuple[str, ...]) -> MarkTemplate:
-    col, row = np.array(template.origin_px) + _FLIP @ move_mm * 1000 / template.pitch_um
-    return replace(template, origin_px=(float(col), float(row)), alike=alike)

@@ -133,24 +133,22 @@ class LinearFit:
 
         area (height, width): pixels around the mark, including those masked as damage, which may be texture.
         """
-        shown = self.design[-GREY] / self.steadiness
-        return self._texture_px2(shown, area) + self._texture_px2(1 - shown, area)
-
-    def _texture_px2(self, share: Array, area: Mask) -> Array:
-        """(2, 2) covariance due to the texture of one side. share (height, width): its fraction of each pixel."""
-        side = area & (share > _MOSTLY)
-        if not side.any():
-            return np.zeros((2, 2))
-        beyond_dn2 = self._texture_dn2(side)
-        texture = np.where(side, self._uncut, 0.0)
-        texture[side] -= texture[side].mean()
-        lags = faded(autocovariance(texture, side, _TEXTURE_PX))
-        alike = lags[_TEXTURE_PX, _TEXTURE_PX + 1]  # of neighbours: noise of single pixels is accounted for elsewhere
-        if beyond_dn2 == 0.0 or alike <= 0.0:
-            return np.zeros((2, 2))
-        lags[_TEXTURE_PX, _TEXTURE_PX] = alike
-        moved = self.by_grey[:2] * share
-        return _positive(products(moved, correlated(moved, NoiseModel(beyond_dn2, lags * (beyond_dn2 / alike), 1.0))))
+        shown, both = self.design[-GREY] / self.steadiness, np.zeros((2, 2))
+        for share in (shown, 1 - shown):  # fraction of each pixel
+            side = area & (share > _MOSTLY)
+            beyond_dn2 = self._texture_dn2(side) if side.any() else 0.0
+            if beyond_dn2 == 0.0:
+                continue
+            texture = np.where(side, self._uncut, 0.0)
+            texture[side] -= texture[side].mean()
+            lags = faded(autocovariance(texture, side, _TEXTURE_PX))
+            # Of neighbours: noise of single pixels is accounted for elsewhere.
+            alike = lags[_TEXTURE_PX, _TEXTURE_PX + 1]
+            if alike <= 0.0:
+                continue
+            lags[_TEXTURE_PX, _TEXTURE_PX] = alike
+            both += _covariance_by_texture(self.by_grey[:2] * share, lags * (beyond_dn2 / alike))
+        return both
 
     def _texture_dn2(self, side: Mask) -> float:
         """Robust variance of smoothed residuals in excess of the smoothed noise; 0 if not significant (3 sigma)."""
@@ -233,12 +231,12 @@ class Landscape:
         to the grey values of the mark's window."""
         if self.frame_pixels.sum() < _LEAST_PX:
             return np.zeros((len(by_grey),) * 2)
-        moved, reach = by_grey * self.share, max(self.share.shape)
+        reach = max(self.share.shape)
         uneven = np.where(self.frame_pixels, self.light - self.light[self.frame_pixels].mean(), 0.0)
         lags = autocovariance(uneven, self.frame_pixels, reach)
         # Noise of single pixels is accounted for elsewhere; the covariance of neighbours is the texture.
         lags[reach, reach] = max(lags[reach, reach + 1], 0.0)
-        return _positive(products(moved, correlated(moved, NoiseModel(float(lags[reach, reach]), lags, 1.0))))
+        return _covariance_by_texture(by_grey * self.share, lags)
 
 
 def _smooth(images: Array, sigma_px: float) -> Array:
@@ -246,9 +244,12 @@ def _smooth(images: Array, sigma_px: float) -> Array:
     return np.asarray(gaussian_filter(images, (0.0, sigma_px, sigma_px), mode="constant"))
 
 
-def _positive(covariance: Array) -> Array:
-    """(n, n) positive semidefinite part: noisy far lags may produce negative eigenvalues."""
-    sizes, axes = np.linalg.eigh((covariance + covariance.T) / 2)
+def _covariance_by_texture(by_grey: Array, lags: Array) -> Array:
+    """(n, n) covariance of quantities with derivatives by_grey (n, height, width) with respect to the grey values, by
+    texture with an autocovariance (lags, lags)."""
+    reach = len(lags) // 2
+    covariance = products(by_grey, correlated(by_grey, NoiseModel(float(lags[reach, reach]), lags, 1.0)))
+    sizes, axes = np.linalg.eigh((covariance + covariance.T) / 2)  # noisy far lags may give negative eigenvalues
     return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)
 
 
@@ -349,7 +350,12 @@ def across_edges(slopes: Array, smoothing_px: float) -> Array:
     the edges. slopes (2, height, width): gradient of the mark's image."""
     square = np.maximum((slopes**2).sum(axis=0), 1e-300)
     across = (slopes[0] ** 2 / square, 2 * slopes[0] * slopes[1] / square, slopes[1] ** 2 / square)
-    smooth, slope, bend = _kernels(smoothing_px)
+    reach = int(np.ceil(4 * smoothing_px))
+    place = np.arange(-reach, reach + 1.0)
+    smooth = np.exp(-(place**2) / (2 * smoothing_px**2))
+    smooth /= smooth.sum()
+    slope, bend = -place * smooth / smoothing_px**2, (place**2 / smoothing_px**2 - 1) * smooth / smoothing_px**2
+    bend -= bend.mean()  # a uniform area gives zero
     along = ((bend, smooth), (slope, slope), (smooth, bend))
     return np.stack(
         [
@@ -360,16 +366,6 @@ def across_edges(slopes: Array, smoothing_px: float) -> Array:
             for part in slopes
         ]
     )
-
-
-def _kernels(sigma_px: float) -> tuple[Array, Array, Array]:
-    """Kernels of a Gaussian and its first two derivatives. The second sums to zero, so a uniform area gives zero."""
-    reach = int(np.ceil(4 * sigma_px))
-    place = np.arange(-reach, reach + 1.0)
-    smooth = np.exp(-(place**2) / (2 * sigma_px**2))
-    smooth /= smooth.sum()
-    bend = (place**2 / sigma_px**2 - 1) * smooth / sigma_px**2
-    return smooth, -place * smooth / sigma_px**2, bend - bend.mean()
 
 
 # Rotation and scale by the mark's own image, where it was matched with those of the frame.
@@ -416,15 +412,10 @@ def honest_covariance(template: MarkTemplate, scan: str, fit: MarkFit) -> Covari
     template comes from that scan alone there are no residuals, and the noise is that of the template.
     Slopes of the template that are noise carry no information on the place, but the fit used them.
     """
-    share = template.shares.get(scan, 0.0)
+    share, linear = template.shares.get(scan, 0.0), fit.pixel_from_mark[:, :2]
     if share == 1.0:
         return Covariance.from_noise(_covariance_of_noise(template, fit))
-    return fit.place_covariance.through(_slope_noise_factor(template, fit) / np.sqrt(1.0 - share))
-
-
-def _slope_noise_factor(template: MarkTemplate, fit: MarkFit) -> Array:
-    """(2, 2) factor of an error of the place: squared slopes of the template over those of the mark itself."""
-    linear, blur_px2 = fit.pixel_from_mark[:, :2], SMOOTHED_PX2 + fit.blur_px**2
+    blur_px2 = SMOOTHED_PX2 + fit.blur_px**2
     px_per_sample = linear_scale(linear) * template.pitch_um / 1000
     side = int(np.ceil(len(template.image) * px_per_sample))
     place = np.column_stack([linear, np.full(2, (side - 1) / 2)])
@@ -433,8 +424,8 @@ def _slope_noise_factor(template: MarkTemplate, fit: MarkFit) -> Array:
     noise = template.slope_noise_dn / max(float(np.ptp(template.image)), 1e-9) / px_per_sample
     noise *= SMOOTHED_PX2 / blur_px2  # blur reduces the slopes of white noise by this factor
     squares, axes = np.linalg.eigh(products(slopes, slopes))
-    marks = np.maximum(squares - noise**2 * side**2, _LEAST_SQUARES * squares)
-    return np.asarray(axes * (squares / marks) @ axes.T)
+    marks = np.maximum(squares - noise**2 * side**2, _LEAST_SQUARES * squares)  # squared slopes of the mark itself
+    return fit.place_covariance.through(np.asarray(axes * (squares / marks) @ axes.T) / np.sqrt(1.0 - share))
 
 
 def _covariance_of_noise(template: MarkTemplate, fit: MarkFit) -> Array:

@@ -22,6 +22,7 @@ EDGE_BLURS = 3.0  # in blurs from the frame's border: a thousandth of its step i
 _SCALE_FLOOR = 0.015  # fraction of the contrast, floor of Tukey's scale: clean data would drive it to zero
 _DRAWN = 0.001  # fraction of the contrast, accuracy of rendering and linearisation: lower bound of the noise for priors
 _FLOOR = 0.005  # fraction of the contrast: smaller residuals may be errors of the drawing
+_MOST_DISTORTION = 0.3  # limit of scale, rotation (rad) and shear against the start
 _ITERATIONS, _HALVINGS = 15, 4  # fits that need more steps or more halvings do not converge at all
 _AREA_PX = 0.5  # px: a larger movement of the mark requires a new area
 _LEAST_AREA_PX = 40  # pixels required around a mark
@@ -208,9 +209,13 @@ class PictureFit:
         """Iterate until the mark moves less than tolerance_px, unless the fit has failed."""
         if self.reason:
             return
-        model = self.model
-        if robust:
-            self._take_steadiness()
+        model, coding = self.model, self.window.coding
+        if robust and not (coding.tone.is_identity or model.is_chip):
+            # How the noise grows with light, from the current residuals.
+            model.linearise(self.used)  # a refit has none of its drawings yet
+            drawn, shown = model.drawn_light, np.abs(model.design[-GREY] / model.steadiness)
+            ground = shown < _GROUND * shown.max()
+            model.take_steadiness(steadiness(model.light - drawn, drawn / coding.full_scale_dn, ground, self.telling))
         if model.is_clipped:
             noise_dn = max(robust_scale(model.residuals[self.telling]), ROUNDING_DN)
             if self.used is not self.area:  # damage is masked: the rest is noise
@@ -234,15 +239,6 @@ class PictureFit:
         own = self.telling & (shown > _OWN * shown[self.area].max(initial=0.0))
         return robust_scale(self.model.residuals[own]) if own.sum() >= _LEAST_AREA_PX else 0.0
 
-    def _take_steadiness(self) -> None:
-        """Estimate from the current residuals how the noise grows with light, and set the steadiness."""
-        model, coding = self.model, self.window.coding
-        if not (coding.tone.is_identity or model.is_chip):
-            model.linearise(self.used)  # a refit has none of its drawings yet
-            drawn, shown = model.drawn_light, np.abs(model.design[-GREY] / model.steadiness)
-            ground = shown < _GROUND * shown.max()
-            model.take_steadiness(steadiness(model.light - drawn, drawn / coding.full_scale_dn, ground, self.telling))
-
     def solve(self) -> Array | None:
         """Solve the normal equations with Tukey's or the grain's weights. A blur at its limit is held fixed there."""
         model, weights = self.model, self.weighted
@@ -265,8 +261,13 @@ class PictureFit:
         return moved_px
 
     def failure(self) -> Reason:
-        """Reason why the state is not acceptable."""
-        return self.model.ran_away()
+        """Reason why the state is not acceptable: too far from the start or too distorted."""
+        moved = float(np.hypot(*(self.state.pixel_from_mark[:, 2] - self.model.start[:, 2])))
+        if moved > self.options.max_shift_px:
+            return Reason(f"the fit ran {moved:.1f} px away from where the mark was expected", Code.NO_FIT)
+        if np.abs(self.model.distortion).max() > _MOST_DISTORTION:
+            return Reason("the fitted size or rotation differs too much from the drawing", Code.SIZE)
+        return NO_REASON
 
     def cost(self) -> float:
         """Tukey's loss plus that of the priors."""
@@ -287,7 +288,7 @@ class PictureFit:
         start = before.pixel_from_mark[:, 2]
         self.weighted, smeared = weighted(model.design, self.used, noise, self.contrast_dn)
         self.variance_dn2, held = 1.0, self.variance_dn2
-        settled = gauss_newton(self, _CLOSE_PX, _WEIGHTED_STEPS).moved_px < _SETTLED_PX and not model.ran_away()
+        settled = gauss_newton(self, _CLOSE_PX, _WEIGHTED_STEPS).moved_px < _SETTLED_PX and not self.failure()
         self.variance_dn2, moved = held, np.asarray(self.state.pixel_from_mark[:, 2] - start)
         if settled:
             by_grain = self._covariance(self.weighted, smeared)

@@ -28,13 +28,11 @@ from measure.matching.covariance import (
 )
 from measure.matching.gauss_newton import EDGE_BLURS, PictureFit
 from measure.matching.models import GREY, MatchOptions, PictureModel, State, background_px, smoothed_px2
-from measure.matching.tone_information import mark_tone_information, sharpening_score, tone_without_information
-from measure.matching.window import ScanWindow, clear_of_ends
+from measure.matching.tone_information import mark_tone_information, sharpening_score
+from measure.matching.window import ScanWindow
 from measure.noise.grain import blank_patches, grain_model, is_coloured
 from measure.noise.noise_model import NoiseModel, as_if_white, combined, factors, is_textured, products
 from measure.results import Covariance, MarkFit
-from measure.tone.estimate import MarkTone
-from measure.tone.sharpening import SharpeningScore
 
 __all__ = ["MarkFit", "MatchOptions", "match"]
 
@@ -194,13 +192,41 @@ def _precision(fit: PictureFit, noise: NoiseModel, landscape: Landscape) -> dict
     `MarkFit`."""
     model, used = fit.model, fit.telling
     covariance, by_grey = fit.weigh(noise)
-    priors_dn2 = model.prior_weights * noise.variance_dn2
-    more = second_order(model.design, model.slopes, fit.used, covariance, priors_dn2)
-    by_noise = covariance[:2, :2]
+    linear = LinearFit(model.residuals, used, model.design, by_grey, noise, model.steadiness)
+    freedom, blur = model.options.freedom, model.blur
+    tells_shape = freedom in ("similarity", "affine") and not model.mark.is_round
+    shape, strain = slice(2, 4), slice(4, model.linear.stop)
+    by_width, width = _by_line_width(fit), None
+    if len(by_width) and blur is not None and model.blur_is_at_limit:
+        width = line_width(linear, by_width[0], blur)
+    sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    blur_sigma = np.inf
+    if blur is not None and not model.blur_is_at_limit:
+        blur_sigma = float(sigmas[blur]) / (2 * model.total_blur_px**2)
+    return {
+        "place_covariance": _place_covariance(fit, linear, covariance, landscape),
+        "covariance": covariance,
+        "lost_fraction": fit.lost_fraction,
+        "significance": fit.contrast_dn / max(float(sigmas[-GREY]), 1e-6),
+        "blur_sigma": blur_sigma,
+        "size_sigma": float(sigmas[2]) if len(model.generators) else np.inf,
+        "edges": edge_place(linear, model.blur_px),
+        "sloping": sloping_place(linear) if freedom == "ellipse" and model.background_px is None else None,
+        "line_width": width,
+        "own_shape": own_shape(linear, shape, strain, model.departures) if tells_shape else None,
+        "tone": mark_tone_information(fit, linear, landscape, by_width),
+        "sharpening": sharpening_score(fit, linear, by_width),
+    }
+
+
+def _place_covariance(fit: PictureFit, linear: LinearFit, covariance: Array, landscape: Landscape) -> Covariance:
+    """Covariance of the place by its causes. covariance (unknowns, unknowns): by noise, rounding included."""
+    model, by_grey, by_noise = fit.model, linear.by_grey, covariance[:2, :2]
     rounded = fit.rounding_variance_dn2 * np.trace(products(by_grey[:2], by_grey[:2]))
     share = min(float(rounded / np.trace(by_noise)), 1.0)
-    linear = LinearFit(model.residuals, used, model.design, by_grey, noise, model.steadiness)
     place = Covariance.from_noise((1 - share) * by_noise).plus(Cause.ROUNDING, share * by_noise)
+    priors_dn2 = model.prior_weights * linear.noise.variance_dn2
+    more = second_order(model.design, model.slopes, fit.used, covariance, priors_dn2)
     place = place.plus(Cause.SECOND_ORDER, more * by_noise)
     if isinstance(model.mark, MarkTemplate) and model.mark.steadiness is not None:
         change = fit.contrast_dn / float(np.ptp(model.mark.image))
@@ -212,71 +238,18 @@ def _precision(fit: PictureFit, noise: NoiseModel, landscape: Landscape) -> dict
     place = place.plus(Cause.UNLIKE_DRAWING, halves)
     if not model.is_chip and model.background_px is None:
         place = place.plus(Cause.TEXTURE, linear.texture_px2(fit.area & model.tells))
-    freedom, has_blur = model.options.freedom, model.blur is not None and not model.blur_is_at_limit
-    tells_shape = freedom in ("similarity", "affine") and not model.mark.is_round
-    shape, strain = slice(2, 4), slice(4, model.linear.stop)
-    by_width = _by_line_width(fit)
-    width = None
-    if by_width is not None and model.blur is not None and model.blur_is_at_limit:
-        width = line_width(linear, by_width, model.blur)
-    sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    return {
-        "place_covariance": place,
-        "covariance": covariance,
-        "lost_fraction": fit.lost_fraction,
-        "significance": fit.contrast_dn / max(float(sigmas[-GREY]), 1e-6),
-        "blur_sigma": float(sigmas[model.blur]) / (2 * model.total_blur_px**2) if has_blur else np.inf,
-        "size_sigma": float(sigmas[2]) if len(model.generators) else np.inf,
-        "edges": edge_place(linear, model.blur_px),
-        "sloping": sloping_place(linear) if freedom == "ellipse" and model.background_px is None else None,
-        "line_width": width,
-        "own_shape": own_shape(linear, shape, strain, model.departures) if tells_shape else None,
-        "tone": _mark_tone(fit, linear, priors_dn2, landscape, by_width),
-        "sharpening": _sharpening_score(fit, linear, priors_dn2, by_width),
-    }
+    return place
 
 
-def _by_line_width(fit: PictureFit) -> Array | None:
-    """(height, width) derivative by the logarithm of the width of a cross's lines. None for other marks."""
+def _by_line_width(fit: PictureFit) -> Array:
+    """(n, height, width) derivative by the logarithm of the width of a cross's lines; n is 0 for other marks."""
     model = fit.model
-    if not (isinstance(model.mark, MarkShape) and model.mark.is_cross):
-        return None
     height, width = model.grey.shape
+    if not (isinstance(model.mark, MarkShape) and model.mark.is_cross):
+        return np.zeros((0, height, width))
     wider = picture(widen_lines(model.mark, _WIDER), fit.state.pixel_from_mark, width, height, model.blur_px)
     change = model.detail(wider) * model.steadiness * model.slopes - model.design[-GREY]
-    return np.asarray(model.contrast_dn / np.log(_WIDER) * change)
-
-
-def _mark_tone(
-    fit: PictureFit, linear: LinearFit, priors_dn2: Array, landscape: Landscape, by_width: Array | None
-) -> MarkTone | None:
-    """Information of the mark on the tone curve. None if the curve is known, or for a chip, which comes from scans with
-    the same curve."""
-    model, coding = fit.model, fit.window.coding
-    if coding.tone.is_known or model.is_chip:
-        return None
-    if model.background_px is not None:
-        return tone_without_information(linear, model.light, model.detail, coding)
-    drawn, linear = model.drawn_light, replace(linear, noise=linear.noise.floored(fit.floor_dn**2))
-    clear = clear_of_ends(drawn, model.grey, model.clipped, model.noise_dn)
-    return mark_tone_information(
-        linear, drawn, model.grey, clear, priors_dn2, model.departures, coding, landscape, by_width
-    )
-
-
-def _sharpening_score(
-    fit: PictureFit, linear: LinearFit, priors_dn2: Array, by_width: Array | None
-) -> SharpeningScore | None:
-    """Score of the scan's sharpening. None where the background is not modelled. Pixels masked as damage are included,
-    since halos are taken for damage until they are modelled."""
-    model = fit.model
-    needs_sharpening = model.options.tells_sharpening or fit.window.coding.tone.sharpening
-    if not needs_sharpening or model.background_px is not None or model.is_chip:
-        return None
-    drawn = model.drawn_light
-    shown = fit.area & model.tells & clear_of_ends(drawn, model.grey, model.clipped, model.noise_dn)
-    shown_fit = replace(linear, used=shown)
-    return sharpening_score(shown_fit, drawn, priors_dn2, model.departures, fit.window.coding, by_width)
+    return np.asarray(model.contrast_dn / np.log(_WIDER) * change)[None]
 
 
 def _likeness(fit: PictureFit) -> float:

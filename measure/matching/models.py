@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.array_types import Array, Mask
-from measure.flags import NO_REASON, Code, Reason
 from measure.geometry import linear_scale
 from measure.marks.rendering import Rendering, chip_steadiness, reach_px, render
 from measure.marks.shapes import Mark, MarkTemplate
-from measure.matching.window import ScanWindow, censored, tells
+from measure.matching.window import ScanWindow, censored
 from measure.noise.noise_model import combined, factors
 
 Freedom = Literal["shift", "similarity", "affine", "ellipse"]
@@ -37,9 +36,9 @@ ROUNDING_DN = 0.3  # standard deviation of rounding to whole grey values
 BENT, ROUGHLY_BENT = 0.075, 0.4  # in blurs: outline displacement up to which a Taylor series replaces rendering
 PIXEL_VARIANCE_PX2 = 1 / 12  # px², averaging over the pixel, treated as additional blur
 _AS_NOISY = 0.02  # relative change of the noise below which clipped grey values are not re-evaluated
+_TELLS = 0.5  # slope of a clipped grey value above which its residual counts as an ordinary one
 _LEAST = 1e-300  # lower bound of the squared slope of a clipped grey value, to divide by
 _BLUR_RANGE_PX = (0.3, 6.0)  # px: smaller blur is hidden by the pixel, with larger blur marks are hardly visible
-_MOST_DISTORTION = 0.3  # limit of scale, rotation (rad) and shear against the start
 _LONGEST_SHIFT_PX, _LONGEST_CHANGE = 1.5, 0.1  # px and linear part: longest step for which the linearisation holds
 _MOST_BLURRED = 2.0  # largest factor of the blur in one step
 _LINEAR = 0.015  # in blurs: displacement up to which the design matrix is kept, exact to 1e-4 of the blur
@@ -221,19 +220,18 @@ class PictureModel:
             self.half_tones = self.steadiness * self.state.greys[0] * self.detail(4 * shown.value * (1 - shown.value))
         for each in (self.residuals, self.design):
             each *= self.steadiness
-        self._censor()
+        if self.is_clipped:
+            self._censor()
         self._linearised = self.state, self.residuals
 
     def _censor(self) -> None:
         """Replace the residuals of clipped grey values by deviance residuals (see `censored`)."""
-        if not self.is_clipped:
-            return
         clipped = self.clipped != 0
         self.uncensored = self.residuals.copy()
-        censoring = censored(self.residuals[clipped], self.clipped[clipped], self.noise_dn)
-        self.residuals[clipped], self.slopes[clipped], self.information[clipped] = censoring
-        self.design[:, clipped] *= censoring.slopes
-        self.tells[clipped] = tells(censoring.slopes)
+        deviances, slopes, information = censored(self.residuals[clipped], self.clipped[clipped], self.noise_dn)
+        self.residuals[clipped], self.slopes[clipped], self.information[clipped] = deviances, slopes, information
+        self.design[:, clipped] *= slopes
+        self.tells[clipped] = slopes > _TELLS
 
     def take_noise(self, noise_dn: float) -> None:
         """Set the standard deviation of the noise for clipped grey values; ignored if the change is negligible."""
@@ -270,19 +268,10 @@ class PictureModel:
     def departures(self) -> Array:
         """(unknowns,) deviations of the parameters from their priors."""
         departures = np.zeros(len(self.design))
-        departures[self.linear] = self._parameters(self._distortion)
+        departures[self.linear] = self._parameters(self.distortion)
         if self.blur is not None:
             departures[self.blur] = self.state.variance_px2 - self.options.blur_px**2
         return departures
-
-    def ran_away(self) -> Reason:
-        """Reason why the state is not acceptable: too far from the start or too distorted; empty if acceptable."""
-        moved = float(np.hypot(*(self.state.pixel_from_mark[:, 2] - self.start[:, 2])))
-        if moved > self.options.max_shift_px:
-            return Reason(f"the fit ran {moved:.1f} px away from where the mark was expected", Code.NO_FIT)
-        if np.abs(self._distortion).max() > _MOST_DISTORTION:
-            return Reason("the fitted size or rotation differs too much from the drawing", Code.SIZE)
-        return NO_REASON
 
     def blur_is_held(self, step: Array) -> bool:
         """Whether the blur is at a limit of its range and the step leads beyond it."""
@@ -326,7 +315,8 @@ class PictureModel:
         return np.asarray(self.generators.reshape(-1, 4) @ change.ravel() / 2)  # 2: squared norm of a generator
 
     @property
-    def _distortion(self) -> Array:
+    def distortion(self) -> Array:
+        """(2, 2) change of the linear part from the start, relative."""
         return np.asarray(self.state.pixel_from_mark[:, :2] @ self._mark_from_start - np.eye(2), float)
 
     @property

@@ -1,14 +1,13 @@
-"""Information of a mark's fit on the tone curve, and the derivatives of its place with respect to the curve."""
+"""Information of a mark's fit on the tone curve and on sharpening, and the derivatives of its place by both."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from measure.array_types import Array, Mask
 from measure.matching.covariance import Landscape, LinearFit
-from measure.matching.models import GREY
-from measure.matching.window import Coding
+from measure.matching.gauss_newton import PictureFit
+from measure.matching.models import GREY, PictureModel
 from measure.noise.noise_model import combined, products
 from measure.tone.curve import ToneInformation
 from measure.tone.estimate import MarkTone, ToneScore, tone_score
@@ -16,21 +15,12 @@ from measure.tone.sharpening import SharpeningScore
 
 _PIECE_PX = 8  # px, side of the squares compared with one another, equal to the blocks of JPEG
 _LEAST_CONTRAST = 1e-6  # fraction of the modelled light: a smaller contrast is numerical rounding
+_CLEAR = 3.0  # noise standard deviations between the model and a clipping limit
 _LEAST_VARIANCE = 1e-9  # floor of the score's variance relative to that of the departures
 
 
-def mark_tone_information(
-    fit: LinearFit,
-    drawn: Array,
-    grey: Array,
-    clear: Mask,
-    priors_dn2: Array,
-    departures: Array,
-    coding: Coding,
-    landscape: Landscape,
-    by_width: Array | None = None,
-) -> MarkTone:
-    """Compute the information of a linearised fit on the tone curve, with the fit's unknowns eliminated.
+def mark_tone_information(fit: PictureFit, linear: LinearFit, landscape: Landscape, by_width: Array) -> MarkTone | None:
+    """Compute the information of a fit on the tone curve, with the fit's unknowns eliminated.
 
     The derivatives by the curve are taken at the modelled light; at the observed one they would be correlated with the
     noise. Uneven light on the mark or around it could be mistaken for the curve, so gradients and curvatures of both
@@ -39,72 +29,81 @@ def mark_tone_information(
 
     Parameters
     ----------
-    drawn, grey : (height, width) modelled and observed light.
-    clear : (height, width) mask of pixels far from the ends of the scanner's range. Near an end noise is cut off, which
-        changes an edge as a curve does.
-    priors_dn2, departures : (unknowns,) see `tone_score`.
+    linear : the fit, linearised at its solution.
     landscape : background texture within the mark.
-    by_width : (height, width) derivative by the width of lines, a further unknown. Otherwise the curve would explain
+    by_width : (n, height, width) derivatives by the width of lines, further unknowns. Otherwise the curve would explain
         lines that are narrower or wider than drawn.
+
+    Returns
+    -------
+    MarkTone, without information where only the detail of the mark was fitted, since its background is not modelled.
+    None if the curve is known, or for a chip, which comes from scans with the same curve.
     """
-    tone, full_scale_dn = coding.tone, coding.full_scale_dn
-    on_place = _moved_px(fit, tone.derivatives(grey, full_scale_dn))
-    information = ToneInformation.empty()
-    if _has_contrast(drawn):
-        within = replace(fit, used=fit.used & clear)
-        uneven = np.concatenate([_uneven(fit.design[-GREY], fit.steadiness), _images(by_width, drawn.shape)])
-        changes = tone.derivatives(drawn, full_scale_dn) * within.used * fit.steadiness
-        score, left, covariance = _score(within, changes, priors_dn2, departures, uneven)
-        covariance += landscape.covariance(left) + _least_variances(fit, changes).sum() * np.eye(len(left))
-        covariance *= _disagreement(score, left, np.where(within.used, fit.residuals, 0.0), covariance, on_place)
+    model, tone, full_scale_dn = fit.model, fit.window.coding.tone, fit.window.coding.full_scale_dn
+    if tone.is_known or model.is_chip:
+        return None
+    is_whole, changes = model.background_px is None, tone.derivatives(model.light, full_scale_dn)
+    if not is_whole:
+        changes = np.stack([model.detail(each) for each in changes])
+    on_place, information = _moved_px(linear, changes), ToneInformation.empty()
+    drawn = model.drawn_light if is_whole else model.light
+    if is_whole and _has_contrast(drawn):
+        within = replace(linear, used=linear.used & _clear_of_ends(model), noise=linear.noise.floored(fit.floor_dn**2))
+        uneven = np.concatenate([_uneven(linear.design[-GREY], linear.steadiness), by_width])
+        changes = tone.derivatives(drawn, full_scale_dn) * within.used * linear.steadiness
+        priors_dn2 = model.prior_weights * linear.noise.variance_dn2
+        score, left, covariance = _score(within, changes, priors_dn2, model.departures, uneven)
+        covariance += landscape.covariance(left) + _least_variances(within, changes).sum() * np.eye(len(left))
+        covariance *= _disagreement(score, left, np.where(within.used, linear.residuals, 0.0), covariance, on_place)
         information = score.information(covariance, tone)
-    return _mark_tone(fit, information, on_place, drawn, coding)
+    codes = tone.code(np.quantile(drawn[linear.used], (0.0, 1.0)), full_scale_dn) / full_scale_dn
+    return MarkTone(information, on_place, float(codes[0]), float(codes[1]))
 
 
-def tone_without_information(
-    fit: LinearFit, light: Array, detail: Callable[[Array], Array], coding: Coding
-) -> MarkTone:
-    """Effect of the curve on a mark of which only the detail was fitted. It gives no information on the curve, since
-    its background is not modelled. light (height, width): with background; detail: subtracts the background."""
-    changes = np.stack([detail(each) for each in coding.tone.derivatives(light, coding.full_scale_dn)])
-    return _mark_tone(fit, ToneInformation.empty(), _moved_px(fit, changes), light, coding)
-
-
-def sharpening_score(
-    fit: LinearFit, drawn: Array, priors_dn2: Array, departures: Array, coding: Coding, by_width: Array | None = None
-) -> SharpeningScore | None:
-    """Score the scan's sharpening together with the tone curve, as in `mark_tone_information`. The fit's mask includes
-    halos. by_width (height, width): derivative by the width of lines, a further unknown. None where the model has no
-    contrast."""
+def sharpening_score(fit: PictureFit, linear: LinearFit, by_width: Array) -> SharpeningScore | None:
+    """Score the scan's sharpening together with the tone curve, as in `mark_tone_information`. None where the
+    background is not modelled or the model has no contrast. Pixels masked as damage are included, since halos are taken
+    for damage until they are modelled."""
+    model, tone, full_scale_dn = fit.model, fit.window.coding.tone, fit.window.coding.full_scale_dn
+    needs_sharpening = model.options.tells_sharpening or tone.sharpening
+    if not needs_sharpening or model.background_px is not None or model.is_chip:
+        return None
+    drawn = model.drawn_light
     if not _has_contrast(drawn):
         return None
-    tone, full_scale_dn = coding.tone, coding.full_scale_dn
+    linear = replace(linear, used=fit.area & model.tells & _clear_of_ends(model))
     halos = tone.sharpening.changes(tone.code(drawn, full_scale_dn))
     # Sign: light by a wrong curve lacks the departure, whereas sharpening adds halos to it.
     halos = -tone.slope(drawn, full_scale_dn) * halos
-    changes = np.concatenate([tone.derivatives(drawn, full_scale_dn), halos]) * (fit.used * fit.steadiness)
-    score, _, covariance = _score(fit, changes, priors_dn2, departures, _images(by_width, drawn.shape))
-    covariance += np.diag(_least_variances(fit, changes))
-    return SharpeningScore(score.value, score.normal, covariance, _moved_px(fit, halos))
-
-
-def _images(image: Array | None, shape: tuple[int, ...]) -> Array:
-    """(n, height, width) the image, if there is one."""
-    return np.zeros((0, *shape)) if image is None else image[None]
+    changes = np.concatenate([tone.derivatives(drawn, full_scale_dn), halos]) * (linear.used * linear.steadiness)
+    priors_dn2 = model.prior_weights * linear.noise.variance_dn2
+    score, _, covariance = _score(linear, changes, priors_dn2, model.departures, by_width)
+    covariance += np.diag(_least_variances(linear, changes))
+    return SharpeningScore(score.value, score.normal, covariance, _moved_px(linear, halos))
 
 
 def _has_contrast(drawn: Array) -> bool:
     return bool(np.ptp(drawn) > _LEAST_CONTRAST * np.abs(drawn).max())
 
 
+def _clear_of_ends(model: PictureModel) -> Mask:
+    """(height, width) mask of pixels whose modelled value lies so far from the clipping limits that noise is not cut
+    off, which changes an edge as a curve does."""
+    drawn, sides = model.drawn_light, model.clipped
+    clear = np.ones(drawn.shape, dtype=bool)
+    for side in (1, -1):
+        if np.any(sides == side):
+            clear &= side * (model.grey[sides == side].mean() - drawn) > _CLEAR * model.noise_dn
+    return clear
+
+
 def _score(
-    fit: LinearFit, changes: Array, priors_dn2: Array, departures: Array, uneven: Array | None = None
+    fit: LinearFit, changes: Array, priors_dn2: Array, departures: Array, uneven: Array
 ) -> tuple[ToneScore, Array, Array]:
     """Score of changes (k, height, width) of the used light, what the unknowns leave of these, its covariance (k, k).
     uneven (m, height, width): derivatives by further unknowns."""
-    count = 0 if uneven is None else len(uneven)
-    design = (fit.design if uneven is None else np.concatenate([fit.design, uneven])) * fit.used
-    priors, departures = (np.append(each, np.zeros(count)) for each in (priors_dn2, departures))
+    design = np.concatenate([fit.design, uneven]) * fit.used
+    priors, departures = (np.append(each, np.zeros(len(uneven))) for each in (priors_dn2, departures))
     residuals = np.where(fit.used, fit.residuals, 0.0).ravel()
     flat, flat_changes = (images.reshape(len(images), -1) for images in (design, changes))
     score = tone_score(flat, flat_changes, residuals, priors, departures)
@@ -126,27 +125,18 @@ def _disagreement(score: ToneScore, left: Array, residuals: Array, covariance: A
     weighted = np.linalg.solve(covariance, score.normal).T
     estimate: Array = np.asarray(np.linalg.inv(np.eye(len(covariance)) + weighted @ score.normal) @ weighted, float)
     moved = on_place @ estimate
-    by_piece = moved @ _piece_sums(left * (residuals + combined(estimate @ score.value, left)))
-    return max(float(np.sum(by_piece**2) / max(np.trace(moved @ covariance @ moved.T), 1e-30)), 1.0)
-
-
-def _piece_sums(images: Array) -> Array:
-    """(k, pieces) sums of images (k, height, width) over squares."""
+    images = left * (residuals + combined(estimate @ score.value, left))
     count, height, width = images.shape
     whole = np.pad(images, ((0, 0), (0, -height % _PIECE_PX), (0, -width % _PIECE_PX)))
     squares = whole.reshape(count, whole.shape[1] // _PIECE_PX, _PIECE_PX, -1, _PIECE_PX)
-    return np.asarray(squares.sum(axis=(2, 4)).reshape(count, -1))
+    by_piece = moved @ squares.sum(axis=(2, 4)).reshape(count, -1)
+    return max(float(np.sum(by_piece**2) / max(np.trace(moved @ covariance @ moved.T), 1e-30)), 1.0)
 
 
 def _moved_px(fit: LinearFit, changes: Array) -> Array:
     """(2, k) derivatives of the place with respect to the departures. changes (k, height, width): those of the fitted
     light."""
     return products(fit.by_grey[:2], changes * fit.used * fit.steadiness)
-
-
-def _mark_tone(fit: LinearFit, information: ToneInformation, on_place: Array, light: Array, coding: Coding) -> MarkTone:
-    codes = coding.tone.code(np.quantile(light[fit.used], (0.0, 1.0)), coding.full_scale_dn) / coding.full_scale_dn
-    return MarkTone(information, on_place, float(codes[0]), float(codes[1]))
 
 
 def _uneven(shown: Array, about: Array) -> Array:

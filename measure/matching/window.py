@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -177,8 +176,6 @@ _LEAST_STEPS = 1.5  # grey-value steps per noise standard deviation; with less n
 _FEWEST = 20  # pixels; fewer clipped ones do not affect a fit
 _GROSS = 3.5  # standard deviations beyond which a residual is damage
 _SCALE_ROUNDS = 8  # iterations; each leaves at most two fifths of the error
-_CLEAR = 3.0  # noise standard deviations between the model and a clipping limit
-_TELLS = 0.5  # derivative of the residual above which it counts as an ordinary one
 
 
 def clipped_sides(samples: Samples, full_scale_dn: float, weights: Sequence[float] | None = None) -> Sides:
@@ -195,37 +192,35 @@ def clipped_sides(samples: Samples, full_scale_dn: float, weights: Sequence[floa
     (height, width) int8: 1 at the upper end of the scanner's range or where whites are clipped below it, -1 at the
     lower end, 0 elsewhere.
     """
+    full_bits, limits = int(full_scale_dn).bit_length(), {full_scale_dn}
+    for bits in _BITS:
+        if bits < full_bits:
+            limits |= {float(2**bits - 1), float((2**bits - 1) << (full_bits - bits))}
     sides = np.zeros(samples.shape[:2], np.int8)
     for channel in range(samples.shape[2]):
         if weights is None or weights[channel] > 0:
             grey = samples[..., channel]
-            if grey.max() in _limits(full_scale_dn) or _is_cut(grey):
+            if grey.max() in limits or _is_cut(grey):
                 sides[grey == grey.max()] = 1
             sides[grey == 0] = -1
     return sides
 
 
-class Censored(NamedTuple):
-    """Deviance residuals of n clipped grey values.
-
-    residuals: (n,); slopes: (n,) derivatives with respect to the ordinary residuals, 0 to 1; information: (n,) relative
-    to an ordinary grey value, one to two times the squared slope.
-    """
-
-    residuals: Array
-    slopes: Array
-    information: Array
-
-
-def censored(residuals: Array, sides: Sides, sigma_dn: float) -> Censored:
+def censored(residuals: Array, sides: Sides, sigma_dn: float) -> tuple[Array, Array, Array]:
     """Compute the deviance residuals of clipped grey values. residuals (n,): grey value minus model; sides (n,):
-    clipped end; sigma_dn: standard deviation of the noise."""
+    clipped end; sigma_dn: standard deviation of the noise.
+
+    Returns
+    -------
+    Deviance residuals (n,), their derivatives with respect to the ordinary residuals, 0 to 1, and their information
+    relative to an ordinary grey value, one to two times the squared derivative.
+    """
     within = sides * residuals / sigma_dn
     log_chance = np.asarray(log_ndtr(-within), dtype=float)
     hazard = _hazard(within, log_chance)
     size = np.sqrt(np.maximum(-2 * log_chance, 1e-300))
     slopes = np.minimum(hazard / size, 1.0)
-    return Censored(sides * sigma_dn * size, slopes, np.clip(hazard * (hazard - within), slopes**2, 2 * slopes**2))
+    return sides * sigma_dn * size, slopes, np.clip(hazard * (hazard - within), slopes**2, 2 * slopes**2)
 
 
 def noise_scale(residuals: Array, sides: Sides, start_dn: float, least_dn: float) -> float:
@@ -247,21 +242,6 @@ def noise_scale(residuals: Array, sides: Sides, start_dn: float, least_dn: float
     return sigma
 
 
-def clear_of_ends(drawn: Array, grey: Array, sides: Sides, sigma_dn: float) -> Mask:
-    """(height, width) mask of pixels whose modelled value lies so far from the clipping limits that noise is not cut
-    off."""
-    clear = np.ones(drawn.shape, dtype=bool)
-    for side in (1, -1):
-        if np.any(sides == side):
-            clear &= side * (grey[sides == side].mean() - drawn) > _CLEAR * sigma_dn
-    return clear
-
-
-def tells(slopes: Array) -> Mask:
-    """Mask of residuals that have the full scatter of the noise and so can estimate it."""
-    return np.asarray(slopes > _TELLS)
-
-
 def _hazard(within: Array, log_chance: Array) -> Array:
     """Hazard function of the normal distribution: density over tail probability."""
     return np.asarray(np.exp(_LOG_DENSITY - within**2 / 2 - log_chance))
@@ -281,12 +261,3 @@ def _is_cut(grey: Samples) -> bool:
         return False
     tail = int((grey >= float(greatest) - _TAIL * sigma).sum())
     return bool(bdtrc(pile - 1, tail, step / (_TAIL * sigma)) < NATURAL_END)
-
-
-def _limits(full_scale_dn: float) -> set[float]:
-    full_bits = int(full_scale_dn).bit_length()
-    limits = {full_scale_dn}
-    for bits in _BITS:
-        if bits < full_bits:
-            limits |= {float(2**bits - 1), float((2**bits - 1) << (full_bits - bits))}
-    return limits

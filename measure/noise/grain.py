@@ -18,7 +18,7 @@ from scipy import fft
 from scipy.optimize import nnls
 
 from measure.array_types import Array, Mask, Single
-from measure.noise.noise_model import NoiseModel, padded, to_orthonormal
+from measure.noise.noise_model import NoiseModel, padded
 
 Lags = NDArray[np.intp]  # (n, 2) rows and columns between pixels, all of one length
 
@@ -32,23 +32,18 @@ _FEWEST = 6  # patches needed to improve on the mark's own window
 _REACH_PX = 8  # lag at which grain of 1.5 px has a correlation of 0.001
 _FARTHEST_PX = 3.0  # largest lag compared; beyond it the residuals show the fit rather than the noise
 _FARTHEST_BLANK_PX = 5.0  # the same for blank film
+_ALIKE = 1e-10  # relative eigenvalue below which images are linearly dependent
 
 
-def _plane() -> Array:
-    """(pixels, 3) orthonormal basis of planes over a patch."""
-    row, col = np.mgrid[:PATCH_PX, :PATCH_PX].reshape(2, -1) - (PATCH_PX - 1) / 2
-    base, _ = np.linalg.qr(np.stack([np.ones(PATCH_PX**2), col, row], axis=1))
-    return np.asarray(base, dtype=np.float64)
-
-
-def _kernels() -> Array:
-    """(1 + grains, lags, lags) autocorrelations of white noise and of white noise under Gaussians."""
-    index = np.arange(-_REACH_PX, _REACH_PX + 1)
-    squared = index[:, None] ** 2 + index**2
-    return np.stack([squared == 0.0, *(np.exp(-squared / (4.0 * grain_px**2)) for grain_px in GRAIN_PX)])
-
-
-PLANE, _KERNELS = _plane(), _kernels()
+_INDEX = np.arange(-_REACH_PX, _REACH_PX + 1)
+_SQUARED_LAGS = _INDEX[:, None] ** 2 + _INDEX**2
+# (1 + grains, lags, lags) autocorrelations of white noise and of white noise under Gaussians.
+_KERNELS: Array = np.stack(
+    [_SQUARED_LAGS == 0.0, *(np.exp(-_SQUARED_LAGS / (4.0 * grain_px**2)) for grain_px in GRAIN_PX)]
+)
+_ROW, _COL = np.mgrid[:PATCH_PX, :PATCH_PX].reshape(2, -1) - (PATCH_PX - 1) / 2
+# (pixels, 3) orthonormal basis of planes over a patch.
+PLANE: Array = np.linalg.qr(np.stack([np.ones(PATCH_PX**2), _COL, _ROW], axis=1))[0]
 
 
 def blank_patches(window: Array, free: Mask, variance_dn2: float) -> Array:
@@ -78,9 +73,7 @@ def _squares(image: Array | Mask) -> Array:
     return np.asarray(inner.swapaxes(1, 2).reshape(-1, PATCH_PX, PATCH_PX), float)
 
 
-def grain_model(
-    residuals: Array, used: Mask, design: Array, neighbour_correlation: float, blank: Array | None = None
-) -> NoiseModel:
+def grain_model(residuals: Array, used: Mask, design: Array, neighbour_correlation: float, blank: Array) -> NoiseModel:
     """Fit a sum of white noise and grains to the residuals, allowing for what the fit absorbs.
 
     Parameters
@@ -88,16 +81,15 @@ def grain_model(
     residuals, used : (height, width) residuals of the fit, and the pixels used.
     design : (unknowns, height, width) derivatives of the fitted model with respect to its unknowns.
     neighbour_correlation : of the residuals.
-    blank : (n, PATCH_PX, PATCH_PX) patches of blank film minus a plane. Where they hold more pixels than the window,
-        they alone are used.
+    blank : (n, PATCH_PX, PATCH_PX) patches of blank film minus a plane, as of `blank_patches`. Where they hold more
+        pixels than the window, they alone are used.
     """
-    has_blank = blank is not None and len(blank) > 0
     parts = []
-    if blank is not None and has_blank:
+    if len(blank):
         pairs, expected = _patch()
         left = _pixel_products(blank, _rings(_FARTHEST_BLANK_PX))
         parts.append((len(blank) * pairs, left, len(blank) * expected))
-    if blank is None or blank.size < used.sum():
+    if blank.size < used.sum():
         rings = _rings(_FARTHEST_PX)
         pairs, left = (_pixel_products(image[None], rings) for image in (used, np.where(used, residuals, 0.0)))
         parts.append((pairs, left, pairs * _ring_kernels(rings) + taken_out(used, design)))
@@ -108,7 +100,7 @@ def grain_model(
     # A fit lowers the correlation of residuals. If it is still above that of the coarsest grain, in the residuals or in
     # the model, a landscape was taken for grain.
     alike, most = max(neighbour_correlation, neighbours / max(variance, 1e-300)), np.exp(-1 / (4.0 * _COARSEST_PX**2))
-    return NoiseModel(float(variance), lags, neighbour_correlation, has_blank and bool(alike < most))
+    return NoiseModel(float(variance), lags, neighbour_correlation, bool(len(blank) and alike < most))
 
 
 def taken_out(used: Mask, design: Array, farthest_px: float = _FARTHEST_PX) -> Array:
@@ -129,9 +121,9 @@ def taken_out(used: Mask, design: Array, farthest_px: float = _FARTHEST_PX) -> A
     border, used_design = int(farthest_px), design[:, used]
     within = np.pad(used, border)
     base = np.zeros((len(design), *within.shape), np.float32)
-    orthonormal = to_orthonormal(used_design @ used_design.T)
+    orthonormal = _orthonormal_factors(used_design @ used_design.T)
     base[: len(orthonormal), within] = orthonormal @ used_design
-    shape, index = padded(within.shape, _REACH_PX), np.arange(-_REACH_PX, _REACH_PX + 1)
+    shape = padded(within.shape, _REACH_PX)
     spectra = np.conj(fft.rfft2(base, s=shape))
     flat, counted = base.reshape(len(base), -1), within.ravel().astype(np.float32)
     taken = []
@@ -139,8 +131,17 @@ def taken_out(used: Mask, design: Array, farthest_px: float = _FARTHEST_PX) -> A
         sums = _ring_sums(flat, ring, within.shape[1]) * counted
         sums = (flat @ sums.T) @ flat - 2 * sums
         lags = fft.irfft2((spectra * fft.rfft2(sums.reshape(base.shape), s=shape)).sum(axis=0), s=shape)
-        taken.append(_KERNELS.reshape(len(_KERNELS), -1) @ lags[np.ix_(index, index)].ravel())
+        taken.append(_KERNELS.reshape(len(_KERNELS), -1) @ lags[np.ix_(_INDEX, _INDEX)].ravel())
     return np.stack(taken, axis=1)
+
+
+def _orthonormal_factors(normal: Array) -> Array:
+    """(k, n) factors that combine images to an orthonormal basis of their k-dimensional span; normal (n, n): their
+    inner products."""
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    values, vectors = np.linalg.eigh(normal / np.outer(size, size))
+    significant = values > _ALIKE * values[-1]
+    return np.asarray((vectors[:, significant] / np.sqrt(values[significant])).T / size)
 
 
 def _pixel_products(images: Array | Mask, rings: Sequence[Lags]) -> Array:

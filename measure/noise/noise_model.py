@@ -14,7 +14,6 @@ from measure.noise.robust_estimation import Real, robust_scale
 WHITE = 0.02  # least fraction of white noise: grain is not known better at the highest frequencies
 REACH_PX = 5  # reach of the coarsest grain that matters at scanning pitch, correlated over 1.5 px
 
-_ALIKE = 1e-10  # relative eigenvalue below which images are linearly dependent
 _ODDS = 13.8  # chi-square of two coordinates at p = 0.001
 _TEXTURE = 0.25  # correlation at REACH_PX that grain never has
 _POWER, _POWER_SIGMA, _MOST = 0.4, 0.25, 1 - 1 / 2.2  # exponent of noise over light: prior, its sigma, upper bound
@@ -38,15 +37,6 @@ def combined(factors: Array, images: Array) -> Array:
 def products(first: Array, second: Array) -> Array:
     """(n, m) inner products of images (n, height, width) and (m, height, width)."""
     return np.asarray(first.reshape(len(first), -1) @ second.reshape(len(second), -1).T)
-
-
-def to_orthonormal(normal: Array) -> Array:
-    """(k, n) factors that combine images to an orthonormal basis of their k-dimensional span; normal (n, n): their
-    inner products."""
-    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    values, vectors = np.linalg.eigh(normal / np.outer(size, size))
-    significant = values > _ALIKE * values[-1]
-    return np.asarray((vectors[:, significant] / np.sqrt(values[significant])).T / size)
 
 
 def factors(images: Array, image: Array) -> Array:

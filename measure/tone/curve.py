@@ -27,6 +27,9 @@ _POWER, _POWER_SIGMA = 1.6, 0.6
 _WAVE_SIGMAS = (0.3, 0.5, 0.2, 0.15)
 _SIGMAS = np.array([_POWER_SIGMA, *_WAVE_SIGMAS])
 _COUNT = len(_SIGMAS)
+_LEGENDRE = [np.polynomial.legendre.Legendre.basis(degree)(2 * _MIDDLES - 1) for degree in range(1, _COUNT)]
+# (k, pieces) change of the log slope by one standard deviation of each departure.
+_WAVES: Array = _SIGMAS[:, None] * np.stack([np.log(_MIDDLES + _TOE), *_LEGENDRE])
 # Prior of a declared curve: programs round it, and a scanner does not follow it exactly in highlights and shadows.
 _DECLARED_SIGMA = 0.1  # fraction of the standard deviations above
 # Variances tried for the departures of the images' own curves from the scanner's.
@@ -80,13 +83,6 @@ class ToneInformation:
     @classmethod
     def empty(cls) -> "ToneInformation":
         return cls(np.zeros((_COUNT, _COUNT)), np.zeros(_COUNT), 0.0, 0)
-
-    @classmethod
-    def from_score(cls, normal: Array, score: Array, covariance: Array) -> "ToneInformation":
-        """Information of a score (k,) with a covariance (k, k) and derivatives normal (k, k) by the departures."""
-        weighted = np.linalg.solve(covariance, np.column_stack([normal, score])).T
-        matrix = weighted[:-1] @ normal
-        return cls((matrix + matrix.T) / 2, weighted[-1] @ normal, float(weighted[-1] @ score), len(score))
 
     @classmethod
     def pooled(cls, each: Sequence["ToneInformation"], scatter: float = 0.0) -> "ToneInformation":
@@ -179,26 +175,11 @@ class Tone:
             curves += [self.shift_to_power(power)] if apart > _ANOTHER else []
         return tuple(curves[1:])
 
-    def doubted(self, other: "Tone", value: float) -> "Tone":
-        """Enlarge the covariance by the distance to an implausible estimate, whose power is value."""
-        off = other.mean - self.mean
-        source = f"{self.source}; the marks say {value:.2f}, as no scanner does, which was not taken"
-        return replace(self, covariance=self.covariance + np.outer(off, off), source=source, before=self)
-
-    def vague_prior(self) -> "Tone":
-        """Base curve with the vague prior of an undeclared one, between linear and sRGB."""
-        mean = np.zeros(_COUNT)
-        mean[0] = (_POWER - self._base_power) / _POWER_SIGMA
-        return replace(self, mean=mean, covariance=np.eye(_COUNT))
-
     def shift_to_power(self, value: float) -> "Tone":
         """Initial curve, shifted in its first departure so that it approximates a power."""
         mean = self.mean.copy()
         mean[0] += (value - self.equivalent_power(0.1, 0.9)[0]) / _POWER_SIGMA
         return replace(self, mean=mean, before=self.prior)
-
-    def replace_departures(self, mean: Array) -> "Tone":
-        return replace(self, mean=mean)
 
     @property
     def plausible_curves(self) -> tuple["Tone", ...]:
@@ -206,7 +187,7 @@ class Tone:
         if self.is_known:
             return (self,)
         sigma = np.sqrt(self.covariance[0, 0]) * np.eye(_COUNT)[0]
-        return self.replace_departures(self.mean - sigma), self.replace_departures(self.mean + sigma)
+        return replace(self, mean=self.mean - sigma), replace(self, mean=self.mean + sigma)
 
     def include_information(self, others: Sequence[ToneInformation]) -> "Tone":
         """Update the curve by information from other scans of the scanner.
@@ -238,7 +219,11 @@ class Tone:
         tone, scatter, log_likelihood = self._most_likely(each)
         if not self.is_declared:
             return tone, scatter
-        free, free_scatter, free_log_likelihood = self.vague_prior()._most_likely(each)
+        # With the vague prior of an undeclared curve, between linear and sRGB.
+        mean = np.zeros(_COUNT)
+        mean[0] = (_POWER - Tone(self.base).equivalent_power(0.1, 0.9)[0]) / _POWER_SIGMA
+        vague = replace(self, mean=mean, covariance=np.eye(_COUNT))
+        free, free_scatter, free_log_likelihood = vague._most_likely(each)
         if free_log_likelihood - log_likelihood < _CONTRADICTED:
             return tone, scatter
         source = f"{self.source}, but the pictures contradict it"
@@ -308,10 +293,6 @@ class Tone:
         return 1 + float(of_slope @ slope), float(np.sqrt(max(sigma2, 0.0)))
 
     @cached_property
-    def _base_power(self) -> float:
-        return Tone(self.base).equivalent_power(0.1, 0.9)[0]
-
-    @cached_property
     def _steps(self) -> Array:
         return np.asarray(np.diff(self.base) * np.exp(self.mean @ _WAVES))
 
@@ -344,12 +325,4 @@ def _log_determinant(variance: float, each: Sequence[ToneInformation]) -> float:
     return float(np.linalg.slogdet(np.eye(_COUNT) + variance * matrices)[1].sum())
 
 
-def _waves(code: Array) -> Array:
-    """(k, n) change of the log slope by one standard deviation of each departure."""
-    x = 2 * code - 1
-    waves = [np.polynomial.legendre.Legendre.basis(degree)(x) for degree in range(1, len(_WAVE_SIGMAS) + 1)]
-    return np.asarray(_SIGMAS[:, None] * np.stack([np.log(code + _TOE), *waves]))
-
-
-_WAVES = _waves(_MIDDLES)
 LINEAR = Tone()

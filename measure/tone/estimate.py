@@ -71,9 +71,10 @@ class FrameTone:
         value = tone.equivalent_power(*ends)[0]
         if not _POWERS[0] <= value <= _POWERS[1]:
             off = tone.mean - prior.mean
-            return cls(
-                prior.doubted(tone, value).sharpened(sharpening), None, *ends, 0.0, float(off @ off), is_determined
-            )
+            source = f"{prior.source}; the marks say {value:.2f}, as no scanner does, which was not taken"
+            covariance = prior.covariance + np.outer(off, off)
+            doubted = replace(prior, covariance=covariance, source=source, before=prior).sharpened(sharpening)
+            return cls(doubted, None, *ends, 0.0, float(off @ off), is_determined)
         information = replace(ToneInformation.pooled(each, scatter), sharpening=sharpening)
         tone = replace(tone, before=prior).sharpened(sharpening)
         return cls(tone, information, *ends, scatter, float(step @ step), is_determined)
@@ -112,7 +113,7 @@ class FrameTone:
     def next_curve(self, before: Tone) -> Tone:
         """Curve for the next matching, limited to the range of the linearisation around the previous one."""
         step = self.tone.mean - before.mean
-        return self.tone.replace_departures(before.mean + step / max(float(np.abs(step).max()) / _LONGEST, 1.0))
+        return replace(self.tone, mean=before.mean + step / max(float(np.abs(step).max()) / _LONGEST, 1.0))
 
 
 # Score of a tone curve from the residuals of fits of marks and edges, with their other unknowns eliminated.
@@ -147,7 +148,11 @@ class ToneScore:
         """Pool the information of all images, fitted with a tone curve. covariance (k, k): of the sum of the scores."""
         count = self.value.shape[-1]
         normal, value = self.normal.reshape(-1, count, count).sum(axis=0), self.value.reshape(-1, count).sum(axis=0)
-        return ToneInformation.from_score(normal, value + normal @ tone.mean, covariance)
+        value = value + normal @ tone.mean
+        weighted = np.linalg.solve(covariance, np.column_stack([normal, value])).T
+        matrix = weighted[:-1] @ normal
+        sum_of_squares = float(weighted[-1] @ value)
+        return ToneInformation((matrix + matrix.T) / 2, weighted[-1] @ normal, sum_of_squares, count)
 
 
 def tone_score(

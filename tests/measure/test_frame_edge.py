@@ -220,7 +220,7 @@ def test_a_corner_moves_with_the_tone_curve_as_its_edges_say(gamma: float) -> No
     estimate = fit_mark(tone).tone
     assert estimate is not None
     for k in range(2):
-        more, less = (fit_mark(tone.replace_departures(way * 0.1 * np.eye(5)[k])).center_px for way in (1, -1))
+        more, less = (fit_mark(replace(tone, mean=way * 0.1 * np.eye(5)[k])).center_px for way in (1, -1))
         np.testing.assert_allclose((more - less) / 0.2, estimate.on_place[:, k], atol=0.1)
     assert np.hypot(*estimate.on_place[:, 0]) > 0.15
     assert estimate.information.sum_of_squares < 25  # of 5 figures, by the true curve

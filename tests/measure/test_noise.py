@@ -91,7 +91,7 @@ def test_variance_and_power_of_grain_are_found_behind_a_fit_that_took_most_of_it
         noise = grain * 2.0 * grain_px * np.sqrt(np.pi) + white * rng.standard_normal((size, size))
         residuals = np.zeros((size, size))
         residuals[used] = noise[used] - directions @ (directions.T @ noise[used])
-        models.append(grain_model(residuals, used, design, 0.5))
+        models.append(grain_model(residuals, used, design, 0.5, np.zeros((0, PATCH_PX, PATCH_PX))))
         naive.append(noise_model(residuals, used, len(design)))
     variance = np.median([model.variance_dn2 for model in models])
     power = np.median([model.autocovariance_dn2.sum() for model in models])

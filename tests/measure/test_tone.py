@@ -94,7 +94,7 @@ def test_departures_change_light_as_their_derivatives_say() -> None:
     tone, codes = Tone.unknown(), np.linspace(0.1, 0.9, 9) * FULL
     for k in range(5):
         step = np.eye(5)[k] * 1e-3
-        more, less = (tone.replace_departures(way * step).light(codes, FULL).astype(float) for way in (1, -1))
+        more, less = (replace(tone, mean=way * step).light(codes, FULL).astype(float) for way in (1, -1))
         by_departure = (more - less) / 2e-3
         result = tone.derivatives(tone.light(codes, FULL), FULL)[k]
         gain = np.polyfit(tone.light(codes, FULL).astype(float), by_departure - result, 1)  # but for gain and offset
