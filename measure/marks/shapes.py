@@ -305,15 +305,11 @@ def turned(mark: Mark, angle_deg: float) -> Mark:
 
 def turned_part(part: Part, angle_deg: float) -> Part:
     """Rotate a part counter-clockwise around the mark's origin; quarter turns are exact."""
-
-    def turn(point: Point) -> Point:
-        return _turned_point(point, angle_deg)
-
     if isinstance(part, Polygon):
-        return Polygon(tuple(turn(vertex) for vertex in part.vertices_mm))
+        return Polygon(tuple(_turned_point(vertex, angle_deg) for vertex in part.vertices_mm))
     if isinstance(part, Bar):
-        return Bar(turn(part.from_mm), turn(part.to_mm), part.line_mm)
-    return replace(part, center_mm=turn(part.center_mm))
+        return Bar(_turned_point(part.from_mm, angle_deg), _turned_point(part.to_mm, angle_deg), part.line_mm)
+    return replace(part, center_mm=_turned_point(part.center_mm, angle_deg))
 
 
 def _turned_rectangle(rectangle: tuple[Point, Point], angle_deg: float) -> tuple[Point, Point]:

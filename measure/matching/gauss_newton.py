@@ -51,13 +51,10 @@ class Model(Protocol):
 
 
 @runtime_checkable
-class ReversibleModel(Protocol):
+class ReversibleModel(Model, Protocol):
     """Model whose steps can be halved. state: replaced by each step."""
 
     state: Any
-
-    def step(self, step: Array) -> float:
-        """Apply a step, like `Model.step`."""
 
     def cost(self) -> float:
         """Objective function that the steps reduce."""
