@@ -119,7 +119,8 @@ def juhl(settings: Settings, xy: Array, _: Array, parameters: Array) -> Correcti
     return Correction(by_parameters @ parameters, xy_jacobian, np.zeros_like(xy_jacobian), lambda: by_parameters)
 
 
-STRETCH, SHEAR, TILT_X, TILT_Y = "stretch", "shear", "tilt x", "tilt y"
+COMBINED = {"stretch": 1, "shear": 1, "tilt_x": 2, "tilt_y": 2}  # combinations of products, and their total degrees
+STRETCH, SHEAR, TILT_X, TILT_Y = COMBINED
 Term = str | tuple[int, int, int]  # one of the four combinations, or (0 for dx or 1 for dy, m, n)
 
 
@@ -184,8 +185,7 @@ GRUEN = _polynomial_set(
 
 def degree_groups(of: PolynomialSet) -> tuple[tuple[str, tuple[str, ...]], ...]:
     """Group the parameters by their total degree in x and y."""
-    combined = {STRETCH: 1, SHEAR: 1, TILT_X: 2, TILT_Y: 2}
-    degrees = [combined[term] if isinstance(term, str) else sum(term[1:]) for term in of.terms]
+    degrees = [COMBINED[term] if isinstance(term, str) else sum(term[1:]) for term in of.terms]
     return tuple(
         (f"degree {degree}", tuple(name for name, own in zip(of.names, degrees, strict=True) if own == degree))
         for degree in sorted(set(degrees))

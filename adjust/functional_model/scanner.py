@@ -22,23 +22,13 @@ import numpy as np
 
 from adjust.array_types import Array, Mask
 from adjust.functional_model.correction import Correction, no_correction
-from adjust.functional_model.distortion_models import (
-    SHEAR,
-    STRETCH,
-    TILT_X,
-    TILT_Y,
-    PolynomialSet,
-    Term,
-    legendre_terms,
-    summed,
-)
+from adjust.functional_model.distortion_models import COMBINED, PolynomialSet, Term, legendre_terms, summed
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.transformation import polynomial_order
 from adjust.linear_algebra.small_matrices import newton, product
 
 SMOOTH = (2, 3)  # total degrees of the smooth terms
 ALONG = (4, 5, 6)  # degrees of the carriage terms, along one axis alone, for tests
-COMBINED = {"stretch": STRETCH, "shear": SHEAR, "tilt_x": TILT_X, "tilt_y": TILT_Y}
 TOLERANCE_MM = 1e-11
 
 
@@ -84,7 +74,7 @@ def _product(name: str) -> tuple[int, int, int]:
 
 def term_degree(name: str) -> int:
     """Total degree of a term in x and y."""
-    return {"stretch": 1, "shear": 1, "tilt_x": 2, "tilt_y": 2}[name] if name in COMBINED else sum(_product(name)[1:])
+    return COMBINED[name] if name in COMBINED else sum(_product(name)[1:])
 
 
 def is_term(name: str) -> bool:
@@ -150,7 +140,7 @@ class Bend:
 
     @cached_property
     def _polynomial_set(self) -> PolynomialSet:
-        terms: dict[str, Term] = {name: COMBINED.get(name) or _product(name) for name in self.terms}
+        terms: dict[str, Term] = {name: name if name in COMBINED else _product(name) for name in self.terms}
         degrees = [2 if isinstance(term, str) else max(term[1:]) for term in terms.values()]
         return legendre_terms(terms, max(degrees))
 

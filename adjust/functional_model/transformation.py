@@ -289,16 +289,7 @@ def _solved(matrix: Array, right: Array) -> tuple[Array, Mask]:
     return solved(matrix, right, regular, of), regular
 
 
-FILM_NAMES = (
-    "none",
-    "congruent",
-    "similarity",
-    "affine",
-    "projective",
-    "bilinear",
-    "conformal(n)",
-    "polynomial(n)",
-)
+FILM_NAMES = ("none", "congruent", "similarity", "affine", "projective", "bilinear", "conformal(n)", "polynomial(n)")
 
 
 @lru_cache

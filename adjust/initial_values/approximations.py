@@ -9,7 +9,6 @@ scanned at once; that of each part follows from it.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from operator import itemgetter
 
 import numpy as np
 
@@ -19,13 +18,7 @@ from adjust.functional_model.families import family
 from adjust.functional_model.lens import Lens
 from adjust.functional_model.rotation import angles_from_rotation, angles_near, rotation_from_angles
 from adjust.functional_model.transformation import LATTICE, film_kind, fit_transformation
-from adjust.initial_values.model_formation import (
-    Block,
-    extend,
-    intersected,
-    known_field,
-    orient_free_model,
-)
+from adjust.initial_values.model_formation import Block, extend, intersected, known_field, orient_free_model
 from adjust.initial_values.pose import KnownField, Pose, Sight, image_distances
 from adjust.initial_values.resection import FEWEST, find_principal_distance, find_wide_distance, resect_images
 from adjust.problem.camera import Camera
@@ -416,7 +409,7 @@ def joined_frame(network: Network, parts: Sequence[Image]) -> tuple[dict[str, Fi
     for part in parts:
         rows = np.flatnonzero(network.image_numbers == network.images.index(part))
         by_mark = {(observations.kind[row], observations.point[row]): network.straight_xy_mm[row] for row in rows}
-        marks_by_part[part.name] = dict(sorted(by_mark.items(), key=itemgetter(0)))
+        marks_by_part[part.name] = {mark: by_mark[mark] for mark in sorted(by_mark)}
     first_from, place = _placed(parts[0].part_of, marks_by_part)
     given = network.camera_by_name[parts[0].camera].fiducials
     marks = sorted(point for kind, point in place if kind == "fiducial")

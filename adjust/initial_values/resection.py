@@ -343,8 +343,7 @@ class _Fields:
             a, b, c = np.moveaxis(self.tangents[np.arange(len(counts))[:, None, None], drawn], 2, 0)
             area = np.abs((b - a)[..., 0] * (c - a)[..., 1] - (b - a)[..., 1] * (c - a)[..., 0])
             slender = (area == 0.0) | (area < 0.5 * np.median(area, axis=1, keepdims=True))
-            best = np.argsort(slender, axis=1, kind="stable")[:, :most, None]
-            triples = np.take_along_axis(drawn, best, axis=1)
+            triples = np.take_along_axis(drawn, np.argsort(slender, axis=1, kind="stable")[:, :most, None], axis=1)
         image = np.repeat(np.arange(len(triples)), triples.shape[1])
         at = image[:, None], triples.reshape(-1, 3)
         rotations, shifts, of = triple_poses(self.points[at], self.tangents[at])

@@ -85,9 +85,9 @@ class Numbering:
             every[place.columns],
         )
         of_images = np.hstack([problem.exterior[:, exterior.members], problem.film_positions[:, film.members]])
-        of_points = self._point_unknowns[:, place.members]
+        of_points = problem.point_positions[:, place.members]
         place_of = np.full(len(unknowns) + 1, len(of_points), dtype=np.intp)  # the last stands for ABSENT
-        place_of[self._point_unknowns[:, :1]] = np.arange(len(of_points))[:, None]
+        place_of[problem.point_positions[:, :1]] = np.arange(len(of_points))[:, None]
         images = image_columns, of_images, problem.image_numbers
         points = place_columns, of_points, place_of[np.where(problem.is_fiducial, ABSENT, problem.places[:, 0])]
         points_own, shared_count = self._blocks.are_points, len(self._shared_order[0])
@@ -126,7 +126,7 @@ class Numbering:
         free = np.flatnonzero(self.problem.unknowns.sigma > 0.0)
         shared = free[~np.isin(free, self._blocks.owned)]
         # Frames or points are groups: those of the kind that blocks do not own. The last element stands for ABSENT.
-        grouped = self._frame_unknowns if self._blocks.are_points else self._point_unknowns
+        grouped = self._frame_unknowns if self._blocks.are_points else self.problem.point_positions
         group_of = np.full(len(self.problem.unknowns) + 1, ABSENT, dtype=np.intp)
         group_of[grouped] = np.arange(len(grouped))[:, None]
         group_of[ABSENT] = ABSENT
@@ -165,7 +165,7 @@ class Numbering:
         tied = np.zeros(len(unknowns) + 1, dtype=bool)  # in further observations; the last stands for ABSENT
         for further in problem.further:
             tied[further.positions] = True
-        of_frames, points = self._frame_unknowns.copy(), self._point_unknowns
+        of_frames, points = self._frame_unknowns.copy(), problem.point_positions
         of_frames[tied[of_frames].any(axis=1)] = ABSENT
         points = points[(unknowns.sigma[points] > 0.0).any(axis=1) & ~tied[points].any(axis=1)]
         free = np.append(unknowns.sigma > 0.0, False)  # the last stands for ABSENT
@@ -193,11 +193,6 @@ class Numbering:
     def _frame_of_rows(self) -> Indices:
         """(n,) number of the frame of each observation."""
         return self.problem.network.frame_numbers[self.problem.image_numbers]
-
-    @cached_property
-    def _point_unknowns(self) -> Indices:
-        """Positions (points, 3) of the unknowns of each point."""
-        return np.array(list(self.problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adjust.array_types import Array
-from adjust.least_squares.equations import (
-    Numbering,
-    WhitenedRows,
-    prior_differences,
-    prior_root_weights,
-    whitened_rows,
-)
+from adjust.least_squares.equations import Numbering, WhitenedRows, prior_differences, prior_root_weights, whitened_rows
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.condition_equations import compute, computed_observations, derivatives

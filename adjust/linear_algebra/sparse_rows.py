@@ -136,7 +136,9 @@ class SparseRows:
         for column, unknowns in zip(self.pattern.columns[0], self.pattern.own.T, strict=True):
             of_rows = self.matrix[:, 0, column] ** 2 + self.matrix[:, 1, column] ** 2
             squares[unknowns] = np.bincount(self.pattern.block, of_rows, len(unknowns))
-        squares[: self.pattern.count] = equations.diagonal
+        squares[: self.pattern.count] = 0.0
+        for front, square in zip(equations.fronts, equations.squares, strict=True):
+            squares[front.columns] += np.diag(square)
         return squares[:-1]
 
     def _cell_squares(self) -> Array:
@@ -177,14 +179,6 @@ class SharedEquations:
             self.values[begin : begin + shape[0] ** 2].reshape(shape)
             for begin, shape in zip(begins, shapes, strict=True)
         ]
-
-    @property
-    def diagonal(self) -> Array:
-        """(s,) diagonal of the normal matrix."""
-        diagonal = np.zeros(self.fronts.count)
-        for front, square in zip(self.fronts, self.squares, strict=True):
-            diagonal[front.columns] += np.diag(square)
-        return diagonal
 
     def add_squares(self, unknowns: Indices, home: Indices, squares: Array) -> None:
         """Add normal matrices (b, s, s) of unknowns (b, s), -1 for none, to those of their fronts home (b,)."""

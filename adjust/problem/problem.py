@@ -240,6 +240,11 @@ class Problem:
         return np.array([self.unknowns.exterior[image.name] for image in self.network.images])
 
     @cached_property
+    def point_positions(self) -> Indices:
+        """(points, 3) positions of all object coordinates."""
+        return np.array(list(self.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
+
+    @cached_property
     def keeps_angles(self) -> Mask:
         """(images,) mask of images whose attitude is updated by its angles instead of a rotation vector."""
         return np.array([self.unknowns.keeps_angles(image.name) for image in self.network.images])

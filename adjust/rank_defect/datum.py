@@ -41,7 +41,7 @@ class ObjectDatum:
 
 def object_datum(problem: Problem, state: State, tolerance: float = EXACT) -> ObjectDatum:
     """Find the similarity transformations that leave all given coordinates, stations, attitudes and distances alone."""
-    points, stations = _point_positions(problem), problem.exterior[:, :3]
+    points, stations = problem.point_positions, problem.exterior[:, :3]
     placed = state.values[points if len(points) else stations]
     center = placed.mean(axis=0)
     extent = float(np.sqrt(((placed - center) ** 2).sum(axis=1).mean())) or 1.0
@@ -71,11 +71,6 @@ def object_datum(problem: Problem, state: State, tolerance: float = EXACT) -> Ob
     return ObjectDatum(center, extent, generators, right[singular <= tolerance].T)
 
 
-def _point_positions(problem: Problem) -> Indices:
-    """(points, 3) positions of all object coordinates."""
-    return np.array(list(problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)
-
-
 def minimal_datum(problem: Problem) -> Indices:
     """Choose minimum constraints: positions of the coordinates that fix the free part of the datum.
 
@@ -83,7 +78,7 @@ def minimal_datum(problem: Problem) -> Indices:
     line, where nothing else fixes them, of points in at least two images. Heights define no scale in a field flatter
     than a thousandth of its extent.
     """
-    state, sigma, positions = problem.start(), problem.unknowns.sigma, _point_positions(problem)
+    state, sigma, positions = problem.start(), problem.unknowns.sigma, problem.point_positions
     free = np.isinf(sigma[positions[:, :2]]).all(axis=1)
     rays = np.bincount(problem.places[~problem.is_fiducial, 0], minlength=len(problem.unknowns))
     usable = positions[free & (rays[positions[:, 0]] >= 2)]
@@ -141,7 +136,7 @@ def centered(problem: Problem, state: State, members: Indices) -> State:
 def free_coordinates(problem: Problem, points: Sequence[str] = ()) -> Indices:
     """Positions of the object coordinates without a prior, of some points or of all."""
     of = problem.unknowns.point
-    positions = np.concatenate([of[point] for point in points]) if points else _point_positions(problem).ravel()
+    positions = np.concatenate([of[point] for point in points]) if points else problem.point_positions.ravel()
     return np.asarray(positions[np.isinf(problem.unknowns.sigma[positions])])
 
 
@@ -152,7 +147,7 @@ def _transformed(problem: Problem, state: State, datum: ObjectDatum, amounts: Ar
         turn, scale = turn * (np.arctan2(sine, scale) / sine if sine else 1.0), float(np.hypot(sine, scale))
     rotation = rotation_from_vector(turn)
     values = state.values.copy()
-    placed = np.concatenate([_point_positions(problem), problem.exterior[:, :3]])
+    placed = np.concatenate([problem.point_positions, problem.exterior[:, :3]])
     moved = datum.center + shift + scale * (values[placed] - datum.center) @ rotation.T
     values[placed] = np.where(problem.unknowns.sigma[placed] == 0.0, values[placed], moved)
     rotations = state.rotations @ rotation.T

@@ -231,7 +231,7 @@ def undetermined(problem: Problem, state: State, variances: Array) -> str:
     unknowns = problem.unknowns
     observed = np.zeros(len(unknowns), dtype=bool)
     observed[np.unique(problem.columns[problem.columns >= 0])] = True
-    observed[[i for point in unknowns.point.values() for i in point]] = False
+    observed[problem.point_positions] = False
     prior = np.where(unknowns.has_prior & observed, unknowns.sigma, np.inf)
     unobserved = np.flatnonzero(np.sqrt(variances) > UNDETERMINED * prior)
     if not len(unobserved):

@@ -231,7 +231,7 @@ class FieldGeometry:
 
 def field_geometry(problem: Problem, state: State, camera: str) -> FieldGeometry:
     """Geometry of the observed points and of the axes of a camera's images."""
-    xyz = state.values[np.array(list(problem.unknowns.point.values()), dtype=np.intp).reshape(-1, 3)]
+    xyz = state.values[problem.point_positions]
     extents = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False) if len(xyz) > 2 else np.zeros(3)
     axes = state.rotations[[image.camera == camera for image in problem.network.images], 2]
     mean = axes.mean(axis=0)

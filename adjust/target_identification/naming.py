@@ -448,14 +448,10 @@ def promising(xyz: Array, normals: Array, marks: Marks, points: Indices, named: 
     ring = _rows(_nearest_points(xyz, points, _FARTHER), of)
     evidence, nearest, hit = _tested(rotations, shifts, xyz[ring], anchors, marks, _LATER_REACH)
     best = np.argsort(-evidence, kind="stable")[:_RETURNED]
-    starts = [
-        (
-            View(rotations[i], shifts[i]),
-            np.append(own[i], ring[i, hit[i]]),
-            np.append(own_marks[i], nearest[i, hit[i]]),
-        )
-        for i in best
-    ]
+    starts: list[Start] = []
+    for i in best:
+        agreeing = np.append(own[i], ring[i, hit[i]]), np.append(own_marks[i], nearest[i, hit[i]])
+        starts.append((View(rotations[i], shifts[i]), *agreeing))
     return starts, tried
 
 
