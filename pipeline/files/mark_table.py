@@ -365,7 +365,12 @@ class PartsTable(DrawnTable):
     def parts(self, table: Table) -> tuple[shapes.Part, ...]:
         if not self.part:
             raise table.error("part", f"a mark of kind 'parts' needs at least one [[{table.place}.part]].")
-        return tuple(_part(part) for part in table.tables("part"))
+        parts = []
+        for entry in table.tables("part"):
+            given: Any = models.read_kind(entry, _PARTS, "shape")
+            plain: type[shapes.Part] = type(given).__bases__[0]  # the class of `shapes` that the model is derived from
+            parts.append(plain(**{field.name: getattr(given, field.name) for field in dataclasses.fields(plain)}))
+        return tuple(parts)
 
 
 MARK_TABLES: Mapping[str, type[MarkTable]] = {
@@ -413,13 +418,6 @@ class _Polygon(shapes.Polygon):
 
 
 _PARTS = {"disk": _Disk, "ring": _Ring, "bar": _Bar, "polygon": _Polygon}
-
-
-def _part(table: Table) -> shapes.Part:
-    """Read a part as the class of `shapes` from which its model is derived."""
-    given: Any = models.read_kind(table, _PARTS, "shape")
-    plain: type[shapes.Part] = type(given).__bases__[0]
-    return plain(**{field.name: getattr(given, field.name) for field in dataclasses.fields(plain)})
 
 
 def scaled_mark(mark: MarkJson, factor: float = 1.0) -> MarkJson:

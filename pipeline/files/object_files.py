@@ -156,9 +156,8 @@ def read_images(path: FilePath, antenna: tuple[float, float, float] = (0.0, 0.0,
             raise InputError(f"{path}, line {row.line}: image {name!r} is given twice. Remove one of the lines.")
         exterior[name] = _exterior(row, antenna)
         camera[name], scanner[name], part_of[name] = row.text("camera"), row.text("scanner"), row.text("part_of")
-        page, window = _page(row), _window(row)
-        if page or window:
-            cuts[name] = page, window
+        if any(cut := _cut(row)):
+            cuts[name] = cut
         text = row.text("turned_deg")
         if text not in ("", "0", "90", "180", "270"):
             raise row.error(
@@ -171,24 +170,18 @@ def read_images(path: FilePath, antenna: tuple[float, float, float] = (0.0, 0.0,
     return GivenImages(exterior, camera, scanner, asks_writing, turned_deg, part_of, cuts)
 
 
-def _page(row: Row) -> int | None:
-    text = row.text("page")
-    if not text:
-        return None
-    if not text.isdecimal() or int(text) < 1:
-        raise row.error("page", f"is {text!r}: the number of a page in the file, from 1, is right.")
-    return int(text)
-
-
-def _window(row: Row) -> Window | None:
-    text = row.text("window")
-    if not text:
-        return None
-    numbers = text.split()
-    if len(numbers) != 4 or not all(number.isdecimal() for number in numbers) or "0" in numbers[2:]:
-        raise row.error("window", f'is {text!r}: "col row width height" in px of the scan is right.')
+def _cut(row: Row) -> tuple[int | None, Window | None]:
+    """Page and window of the scan's file, None where they are not given."""
+    page, window, numbers = row.text("page"), row.text("window"), row.text("window").split()
+    if page and (not page.isdecimal() or int(page) < 1):
+        raise row.error("page", f"is {page!r}: the number of a page in the file, from 1, is right.")
+    if window and (len(numbers) != 4 or not all(map(str.isdecimal, numbers)) or "0" in numbers[2:]):
+        raise row.error("window", f'is {window!r}: "col row width height" in px of the scan is right.')
+    number = int(page) if page else None
+    if not window:
+        return number, None
     col, row_px, width, height = map(int, numbers)
-    return col, row_px, width, height
+    return number, (col, row_px, width, height)
 
 
 def _join(

@@ -357,7 +357,10 @@ def _place(table: Table, model: type, loc: tuple[int | str, ...]) -> tuple[Table
     """Innermost table on a path of keys and numbers, its model, and the rest of the path."""
     while loc:
         key, value = str(loc[0]), table.values.get(str(loc[0]))
-        inner = _inner_model(model, key)
+        names = {name_in_file(field): field.name for field in _model_fields(model)}
+        hint: Any = get_type_hints(model).get(names.get(key, ""))
+        kinds = [each for each in (hint, *get_args(hint)) if isinstance(each, type) and dataclasses.is_dataclass(each)]
+        inner = kinds[0] if kinds else None  # model of a sub-table, or of each of several
         if inner is not None and isinstance(value, dict):
             table, model, loc = table.table(key), inner, loc[1:]
         elif inner is not None and isinstance(value, list) and len(loc) > 1 and isinstance(value[int(loc[1])], dict):
@@ -367,14 +370,6 @@ def _place(table: Table, model: type, loc: tuple[int | str, ...]) -> tuple[Table
         else:
             break
     return table, model, loc
-
-
-def _inner_model(model: type, key: str) -> type | None:
-    """Model of a sub-table or of each of several; None for a key that has none."""
-    fields = {name_in_file(field): field for field in _model_fields(model)}
-    hint: Any = get_type_hints(model).get(fields[key].name) if key in fields else None
-    inner = [each for each in (hint, *get_args(hint)) if isinstance(each, type) and dataclasses.is_dataclass(each)]
-    return inner[0] if inner else None
 
 
 def _model_fields(model: type) -> tuple[dataclasses.Field[Any], ...]:
