@@ -163,7 +163,7 @@ def _converted_adjustment(path: Path, folder: Path, options: ConvertOptions) -> 
     keys = _parameters(name, lens.lens)
     model, sigmas = (np.sqrt(np.diag(select(keys))) for select in (moved.select, moved.select_larger))
     entry = _camera_entry(content.cameras[name], given.distortion, lens, model)
-    gone = {Parameter.interior(name, each).text for each in given.quantities[3:]}
+    gone = {Parameter.interior(name, each) for each in given.quantities[3:]}
     correlations = tuple(row for row in content.correlations if not gone & set(row.parameters))
     converted = replace(content, cameras={**content.cameras, name: entry}, correlations=correlations)
     text = "".join(json_text(converted))

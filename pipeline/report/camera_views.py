@@ -8,7 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from adjust.functional_model.families import parameter_names
-from adjust.problem.parameter import Parameter, parameter_from_text
+from adjust.problem.parameter import Parameter
 from adjust.quality.lens_uncertainty import distortion_curves, is_defined_over_frame
 from pipeline.drawing import svg
 from pipeline.report import fiducials, lens, vectors
@@ -101,11 +101,10 @@ def _plane(
 
 def _correlation_causes(name: str, stored: AdjustmentRecord) -> list[str]:
     """Causes and remedies of high correlations of a camera's quantities, in words."""
-    firsts = (parameter_from_text(each.parameters[0]) for each in stored.correlations)
     return [
         f"{each.cause.replace(' -', ' −')} {each.remedy}"
-        for each, first in zip(stored.correlations, firsts, strict=True)
-        if first.kind == "interior" and first.owner == name
+        for each in stored.correlations
+        if each.parameters[0].kind == "interior" and each.parameters[0].owner == name
     ]
 
 

@@ -105,7 +105,7 @@ def suspect_rows(adjustment: AdjustmentRecord) -> frozenset[assessment_record.Re
 
 def _no_solution(adjustment: AdjustmentRecord) -> Iterator[Problem]:
     for null in adjustment.singular:
-        together = description(parameter_from_text(text, adjustment.cameras) for text in null.parameters)
+        together = description(parameter_from_text(each.text, adjustment.cameras) for each in null.parameters)
         yield Problem(f"{null.cause} The observations do not see it (together move {together}).", null.remedy)
     if not adjustment.converged and not adjustment.singular:
         is_practically = any(warning.startswith("Practically singular") for warning in adjustment.warnings)

@@ -2,7 +2,7 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from importlib.metadata import version
 
@@ -48,10 +48,8 @@ from pipeline.results.adjustment_record import (
 from pipeline.results.assessment_record import (
     ContradictionDirection,
     ContradictionRecord,
-    CorrelationRecord,
     DistanceRecord,
     FiducialDistanceRecord,
-    NullDirectionRecord,
     ObservedQuantity,
     OuterRecord,
     ReliabilityRecord,
@@ -140,13 +138,6 @@ def adjustment_record(
         observations=adjustment.conditions,
         sigma0_from=Sigma0Record(variance.redundancy, variance.is_a_priori, variance.left_out),
         covariance=covariance_note(adjustment),
-        singular=tuple(
-            NullDirectionRecord(_texts(null.parameters), null.cause, null.remedy) for null in adjustment.singular
-        ),
-        correlations=tuple(
-            CorrelationRecord(_texts(each.parameters), each.rho, each.cause, each.remedy)
-            for each in adjustment.correlations
-        ),
         suspects=tuple(map(_suspect, adjustment.suspects)),
         reliability=None if reliability is None else _reliability(reliability, len(network.observations)),
         cameras={
@@ -188,10 +179,6 @@ def adjustment_record(
         calibration_tests=tuple(map(_contradiction, adjustment.contradictions)),
         antennas=tuple(ObservedQuantity(name, *numbers) for name, numbers in further["antenna"]),
     )
-
-
-def _texts(parameters: Sequence[Parameter]) -> tuple[str, ...]:
-    return tuple(each.text for each in parameters)
 
 
 def _camera(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, float] | None) -> CameraRecord:

@@ -18,8 +18,9 @@ from adjust.functional_model.lens import INTERIOR_NAMES, Distortion, Lens
 from adjust.functional_model.scanner import Bend, is_term
 from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.least_squares.iteration import Iteration
-from adjust.problem.estimates import GivenGroup
+from adjust.problem.estimates import GivenGroup, NullDirection
 from adjust.quality.run import Group
+from adjust.quality.significance import Correlation
 from adjust.solution.explanations import Explanation
 from pipeline.results import assessment_record
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit
@@ -420,8 +421,8 @@ class AdjustmentRecord:
     sigma0: Number
     sigma0_from: Sigma0Record | None = None
     covariance: str = ""
-    singular: tuple[assessment_record.NullDirectionRecord, ...]
-    correlations: tuple[assessment_record.CorrelationRecord, ...]
+    singular: tuple[Annotated[NullDirection, FOREIGN], ...]
+    correlations: tuple[Annotated[Correlation, FOREIGN], ...]
     warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)

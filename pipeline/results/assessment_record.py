@@ -5,15 +5,11 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
-from adjust.problem.parameter import parameter_from_text
-from pipeline.results.record_json import Flag, Number, NumberOrNone, Whole
+from pipeline.results.record_json import Flag, Number, NumberOrNone, Whole, read_parameter
 
 
 def _parameter_text(text: str) -> str:
-    try:
-        return parameter_from_text(text).text
-    except ValueError as error:
-        raise ValueError(f"is not what it should be: {error}") from None
+    return read_parameter(text).text
 
 
 ParameterText = Annotated[str, AfterValidator(_parameter_text)]  # as `Parameter.text`
@@ -138,25 +134,6 @@ class ContradictionRecord:
     freedom: Whole
     p: Number
     direction: tuple[ContradictionDirection, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class NullDirectionRecord:
-    """Null direction of a singular network: its parameters, cause and remedy."""
-
-    parameters: tuple[ParameterText, ...]
-    cause: str
-    remedy: str
-
-
-@dataclass(frozen=True, slots=True)
-class CorrelationRecord:
-    """Highly correlated quantities. rho: correlation."""
-
-    parameters: tuple[ParameterText, ...]
-    rho: Number
-    cause: str
-    remedy: str
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_
 import numpy as np
 import pydantic
 
+from adjust.problem.parameter import Parameter, parameter_from_text
 from pipeline.errors import InputError
 from pipeline.text.files import parse_json, quote_value, read_bytes, write_atomically
 from pipeline.text.table_models import name_in_file
@@ -53,6 +54,16 @@ def _wrong(value: Any, expected: str) -> str:
     return f"is {quote_value(value)}; it should be {expected}"
 
 
+def read_parameter(value: Any) -> Parameter:
+    """Read a key of a quantity from its text. Raises ValueError."""
+    if not isinstance(value, str):
+        raise ValueError(_wrong(value, "a text"))
+    try:
+        return parameter_from_text(value)
+    except ValueError as error:
+        raise ValueError(f"is not what it should be: {error}") from None
+
+
 Flag = Annotated[bool, pydantic.Strict()]
 Whole = Annotated[int, pydantic.Strict()]
 Number = Annotated[float, pydantic.PlainValidator(_number)]
@@ -70,6 +81,7 @@ class _Foreign:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: pydantic.GetCoreSchemaHandler) -> Any:
         types: Any = {bool: Flag, int: Whole, float: Number, tuple[float, float]: tuple[Number, Number]}
+        types[tuple[Parameter, ...]] = tuple[Annotated[Parameter, pydantic.PlainValidator(read_parameter)], ...]
         hints = {name: types.get(hint, hint) for name, hint in get_type_hints(source).items()}
         stand_in: Any = make_dataclass(source.__name__, hints.items())
         return handler.generate_schema(
@@ -192,13 +204,16 @@ def _content(record: object) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Convert a value for JSON, non-finite numbers to null; dataclasses are left to the encoder."""
+    """Convert a value for JSON, non-finite numbers to null, keys of quantities to their texts; dataclasses are left to
+    the encoder."""
     if isinstance(value, str | int | None):
         return value
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     if isinstance(value, Mapping):
         return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, Parameter):
+        return value.text
     if hasattr(value, "_fields"):
         return _content(value)
     if isinstance(value, np.ndarray):

@@ -16,6 +16,8 @@ from made_up_calibration import set_adjustment, set_frames, set_mark, set_weak
 from made_up_calibration import set_adjustment as changed
 from projects import present
 
+from adjust.problem.parameter import Parameter
+from adjust.quality.significance import Correlation
 from adjust.solution.explanations import Explanation
 from measure import Code, MarkMeasurement, Reason, ScanOrientation, Status
 from measure.results import FrameMeasurement
@@ -25,7 +27,7 @@ from pipeline.report.frame_problems import fraction_test, places_px
 from pipeline.report.parameters import spoken_name
 from pipeline.report.verdict import NEEDS_A_LOOK, critical_w, sigma0_bounds
 from pipeline.results.adjustment_record import GivenQuantity, Quantity, Sigma0Record
-from pipeline.results.assessment_record import CorrelationRecord, SuspectRecord
+from pipeline.results.assessment_record import SuspectRecord
 from pipeline.results.stage_files import Check
 
 Change = Callable[[ReportData], ReportData]
@@ -213,7 +215,8 @@ def with_tie_points(data: ReportData) -> ReportData:
     return replace(data, comparator=tuple(rows), measurement=None, adjustment=None, thumbnail=None)
 
 
-TRADE_OFF = CorrelationRecord(("IO.RC 20.c", "EO.*.Z0"), 0.98, "c and Z0 trade off.", "Tilt.")
+C_AND_Z0 = (Parameter.interior("RC 20", "c"), Parameter.exterior("*", "Z0"))
+TRADE_OFF = Correlation(C_AND_Z0, 0.98, "c and Z0 trade off.", "Tilt.")
 
 
 @pytest.mark.parametrize(
