@@ -1,4 +1,5 @@
-"""Cameras and scanners in the report: values, distortion, residuals, maps over the frame, fiducials and check."""
+"""Cameras, scanners and joined frames in the report: values, distortion, residuals, maps over the frame, fiducials and
+check."""
 
 import math
 from collections.abc import Iterator
@@ -13,13 +14,11 @@ from adjust.quality.lens_uncertainty import distortion_curves, is_defined_over_f
 from pipeline.drawing import svg
 from pipeline.report import fiducials, lens, vectors
 from pipeline.report.data import ReportData
-from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.numbers import fixed, significant
 from pipeline.report.parameters import camera_values, parameter_rows, term_rows
-from pipeline.report.vectors import contour_plot, coverage_plot, grid_mm, longest_vector, padded_plane, strokes_and_dots
+from pipeline.report.vectors import grid_mm, longest_vector, padded_plane, strokes_and_dots
 from pipeline.results.adjustment_file import Covariance
-from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, ScannerRecord
-from pipeline.results.assessment_record import ResidualRecord
+from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, JoinedFrameRecord, ScannerRecord
 from pipeline.results.image_unit import ImageUnit
 from pipeline.types import Array
 
@@ -34,28 +33,28 @@ LONGEST = 0.8  # longest vector with its ellipse, in grid spacings
 ROOM = 0.06  # margin around the extent, fraction of its longer side
 UM_PER_MM = 1000.0
 
-
-def camera_views(data: ReportData) -> list[SimpleNamespace]:
-    """Cameras of the adjustment for the templates; empty without an adjustment."""
-    stored = data.adjustment
-    return [_view(data, stored, name, camera) for name, camera in stored.cameras.items()] if stored else []
+JOINED_PLOT_PX = 420.0
+LONGEST_JOIN_PX = 40.0
 
 
-def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraRecord) -> SimpleNamespace:
-    images, by_image = stored.camera_images(name), residuals_by_image(data)
-    rows = [row for image in images for row in by_image.get(image, [])]
-    known, unit = data.covariance if stored.converged else None, data.unit_of_camera(name)
+def camera_view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraRecord) -> SimpleNamespace:
+    """Camera of the adjustment for the templates."""
+    images, unit = stored.camera_images(name), data.unit_of_camera(name)
+    rows = [row for image in images for row in data.residuals_by_image.get(image, [])]
+    known = data.covariance if stored.converged else None
     # Without a solution all sigmas are NaN: they do not mean that the camera was left out of the calibration.
     is_calibrated = camera.is_calibrated or not stored.converged
-    covariance = known if is_calibrated else None
-    field, radius_mm = vectors.VectorField.from_residuals(rows), _observed_radius_mm(camera, rows)
+    targets = np.array([(row.camera_x_mm, row.camera_y_mm) for row in rows if row.kind not in ("fiducial", "join")])
+    point, radius_mm = camera.principal_point_mm, 0.0  # from the principal point to the outermost target
+    if len(targets):
+        radius_mm = float(np.hypot(*(targets - (point.x.value, point.y.value)).T).max())
+    field = vectors.VectorField.from_residuals(rows)
     on = _plane(data, name, camera, field, unit) if rows else None
+    plotted = on if is_calibrated else None
     some = vectors.VectorField.from_residuals(rows[:: -(-len(rows) // MOST_VECTORS) or 1])  # evenly from all images
-    figure = fiducials.figure(name, stored, known) if known else None
-    radius = fixed(radius_mm * unit.per_mm, 0)
-    places = np.array([(row.camera_x_mm, row.camera_y_mm) for row in rows if row.kind not in ("fiducial", "join")])
     has_scale = stored.sigma0 > 0.0 and ("interior", name) not in stored.variance_factor.left_out
     parameters = list(parameter_rows(name, camera, stored.sigma0 if has_scale else 1.0, radius_mm, unit))
+    effect_at = f"at {fixed(radius_mm * unit.per_mm, 0)} {unit.long_name}"
     return SimpleNamespace(
         name=name,
         record=camera,
@@ -63,40 +62,19 @@ def _view(data: ReportData, stored: AdjustmentRecord, name: str, camera: CameraR
         images=len(images),
         unit=unit,
         values=camera_values(data, name) if is_calibrated else [],
-        effect_where="in the frame" if is_defined_over_frame(camera.lens()) else f"at {radius} {unit.long_name}",
+        effect_where="in the frame" if is_defined_over_frame(camera.lens()) else effect_at,
         # For a digital camera the values above already state c, x0' and y0' in px.
         parameters=(parameters[3:] if unit.is_pixel else parameters) if is_calibrated else [],
         correlation_causes=_correlation_causes(name, stored),
-        lens=_lens_view(name, camera, covariance, on, radius_mm, unit) if covariance else None,
-        vectors=vectors.all_images_plot(some, on, field.scale(LONGEST_VECTOR_PX))
-        if on is not None and is_calibrated
-        else None,
-        coverage=coverage_plot(on, places) if on is not None and is_calibrated and len(places) else None,
-        observed=len(places),
-        maps=list(_uncertainty_maps(camera, on, data.unit)) if on is not None else [],
-        corrections=figure,
-        corrections_sentence=fiducials.correction_sentence(figure, camera.fiducials, data.coordinates_source(name))
-        if figure
-        else "",
-        corrections_plot=fiducials.figure_plot(figure) if figure else None,
+        lens=_lens_view(name, camera, known, on, radius_mm, unit) if known and is_calibrated else None,
+        vectors=vectors.all_images_plot(some, plotted, field.scale(LONGEST_VECTOR_PX)) if plotted else None,
+        coverage=vectors.coverage_plot(plotted, targets) if plotted and len(targets) else None,
+        observed=len(targets),
+        maps=list(_uncertainty_maps(camera, on, data.unit)) if on else [],
+        corrections=fiducials.figure(name, stored, known) if known else None,
+        given_by=data.coordinates_source(name),
         check=data.check.cameras.get(name) if data.check else None,
     )
-
-
-def _observed_radius_mm(camera: CameraRecord, rows: list[ResidualRecord]) -> float:
-    """Distance from the principal point to the outermost target."""
-    point = camera.principal_point_mm
-    targets = ((row.camera_x_mm, row.camera_y_mm) for row in rows if row.kind not in ("fiducial", "join"))
-    return max((float(np.hypot(x - point.x.value, y - point.y.value)) for x, y in targets), default=0.0)
-
-
-def _plane(
-    data: ReportData, name: str, camera: CameraRecord, field: vectors.VectorField, unit: ImageUnit
-) -> vectors.Plane:
-    """Plane of the camera's frame, or of its observations if the frame size is unknown."""
-    if camera.lens_known is not None and camera.lens_known.frame_mm is not None:
-        return vectors.padded_plane(np.array(camera.lens_known.frame_mm), PLOT_PX, unit=unit)
-    return vectors.plane(field.places_mm, data.frame_mm.get(name), PLOT_PX, unit)
 
 
 def _correlation_causes(name: str, stored: AdjustmentRecord) -> list[str]:
@@ -106,6 +84,15 @@ def _correlation_causes(name: str, stored: AdjustmentRecord) -> list[str]:
         for each in stored.correlations
         if each.parameters[0].kind == "interior" and each.parameters[0].owner == name
     ]
+
+
+def _plane(
+    data: ReportData, name: str, camera: CameraRecord, field: vectors.VectorField, unit: ImageUnit
+) -> vectors.Plane:
+    """Plane of the camera's frame, or of its observations if the frame size is unknown."""
+    if camera.lens_known is not None and camera.lens_known.frame_mm is not None:
+        return padded_plane(np.array(camera.lens_known.frame_mm), PLOT_PX, unit=unit)
+    return vectors.plane(field.places_mm, data.frame_mm.get(name), PLOT_PX, unit)
 
 
 def _lens_view(
@@ -138,19 +125,14 @@ def _uncertainty_maps(camera: CameraRecord, on: vectors.Plane, unit: str) -> Ite
         where = "at infinity" if math.isnan(known.distance) else f"at {significant(known.distance, 3)} {unit}"
         title = f"Standard deviation of projected points {where} over the camera frame"
         x_mm, y_mm, sigma_um = (np.array(each, dtype=float) for each in (known.x_mm, known.y_mm, known.sigma_um))
-        if (plot := contour_plot(on, x_mm, y_mm, sigma_um, title)) is not None:
+        if (plot := vectors.contour_plot(on, x_mm, y_mm, sigma_um, title)) is not None:
             yield where, plot
 
 
-def scanner_views(data: ReportData) -> list[SimpleNamespace]:
-    """Scanners of the adjustment for the template; empty without an adjustment or without scanners."""
-    stored = data.adjustment
-    return [_scanner_view(stored, data.covariance, *each) for each in stored.scanners.items()] if stored else []
-
-
-def _scanner_view(
+def scanner_view(
     stored: AdjustmentRecord, covariance: Covariance | None, name: str, scanner: ScannerRecord
 ) -> SimpleNamespace:
+    """Scanner of the adjustment for the template: its terms, and its bend as a field of vectors."""
     images, rows = sum(image.scanner == name for image in stored.images.values()), list(term_rows(scanner.terms))
     view = SimpleNamespace(name=name, record=scanner, images=images, rows=rows, field=None)
     if not rows or covariance is None or not stored.converged:
@@ -170,6 +152,22 @@ def _scanner_view(
     title = "The scanner's bend with 95 % ellipses over its scans"
     view.field = on.picture(title, px_per_um, *ellipses, strokes_and_dots(starts, ends, "target"))
     view.largest_um = longest_vector(value_um, covariance_um2)
+    return view
+
+
+def joined_view(name: str, frame: JoinedFrameRecord) -> SimpleNamespace:
+    """Frame scanned in parts for the template: RMS difference at tie points in x' and y', name and length of the
+    largest, and a plot."""
+    view = SimpleNamespace(name=name, record=frame, rms_um=(None, None), largest="–", plot=None)
+    if not frame.joins:
+        return view
+    rows = np.array([(row.x_mm, row.y_mm, row.dx_um, row.dy_um) for row in frame.joins])
+    apart = vectors.VectorField(rows[:, :2], rows[:, 2:], np.zeros(len(rows), dtype=bool))
+    lengths_um = np.hypot(*apart.vectors_um.T)
+    view.rms_um = np.sqrt(np.mean(apart.vectors_um**2, axis=0)).tolist()
+    view.largest = f"{frame.joins[int(lengths_um.argmax())].point}: {fixed(float(lengths_um.max()), 1)} µm"
+    on = vectors.plane(apart.places_mm, None, JOINED_PLOT_PX)
+    view.plot = vectors.all_images_plot(apart, on, apart.scale(LONGEST_JOIN_PX))
     return view
 
 

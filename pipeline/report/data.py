@@ -120,11 +120,6 @@ class ReportData:
         has_marks = any(camera.fiducials for camera in cameras)
         return has_marks and not any(camera.is_calibrated for camera in cameras)
 
-    @property
-    def is_digital(self) -> bool:
-        """Whether image lengths are stated in pixels."""
-        return any(unit.is_pixel for unit in self.image_units.values())
-
     @cached_property
     def image_units(self) -> Mapping[str, ImageUnit]:
         """Unit of image lengths by camera of the adjustment; empty if all are in mm and µm."""
@@ -138,6 +133,14 @@ class ReportData:
         if any(len(each) != 1 or math.isnan(min(each)) for each in sizes.values()):
             return {}
         return {name: ImageUnit(min(each)) for name, each in sizes.items()}
+
+    @cached_property
+    def residuals_by_image(self) -> Mapping[str, list[ResidualRecord]]:
+        """Residuals of the adjustment by image."""
+        rows: dict[str, list[ResidualRecord]] = defaultdict(list)
+        for row in self.adjustment.residuals if self.adjustment else ():
+            rows[row.image].append(row)
+        return dict(rows)
 
     def coordinates_source(self, camera: str) -> str:
         """Source of the given fiducial coordinates of a camera."""

@@ -58,12 +58,6 @@ class Figure:
     transformation: str
 
     @property
-    def mark_covariances_um2(self) -> Array:
-        """(n, 2, 2) covariance of the change of each mark."""
-        at = np.arange(len(self.ids))
-        return self.covariance_um2.reshape(len(at), 2, len(at), 2)[at, :, at, :]
-
-    @property
     def sigmas_um(self) -> Array:
         """(n, 2) standard deviations of the changes."""
         return np.sqrt(np.maximum(np.diag(self.covariance_um2), 0.0)).reshape(-1, 2)
@@ -99,19 +93,13 @@ def correction_sentence(form: Figure, fiducials: Mapping[str, FiducialRecord], g
 def figure(name: str, stored: AdjustmentRecord, covariance: Covariance) -> Figure | None:
     """Corrections of a camera's fiducials; None if the datum transformation absorbs all of them."""
     camera = stored.cameras[name]
-    if _is_measured(name, stored):
+    distance_sigmas = [row.sigma_mm for row in stored.fiducial_distances if row.camera == name]
+    given = [each.given for mark in camera.fiducials.values() for each in (mark.x_mm, mark.y_mm)]
+    known = [each.sigma for each in given if each is not None and np.isfinite(each.sigma)]  # NaN: free
+    if distance_sigmas and BETTER * max(distance_sigmas) < min(known, default=np.inf):
         return figure_of_films(name, camera.fiducials, covariance, {}, _MEASURED)
     films = {} if camera.is_calibrated else stored.films(stored.camera_images(name))
     return figure_of_films(name, camera.fiducials, covariance, films)
-
-
-def _is_measured(name: str, stored: AdjustmentRecord) -> bool:
-    """Whether measured distances define the figure of a camera's fiducials much better than given coordinates do."""
-    sigmas = [row.sigma_mm for row in stored.fiducial_distances if row.camera == name]
-    given = [each.given for mark in stored.cameras[name].fiducials.values() for each in (mark.x_mm, mark.y_mm)]
-    known = [each.sigma for each in given if each is not None and np.isfinite(each.sigma)]  # NaN: free
-    least = min(known, default=np.inf)
-    return bool(sigmas) and BETTER * max(sigmas) < least
 
 
 def figure_of_films(
@@ -169,7 +157,8 @@ def _distances(ids: tuple[str, ...], places_mm: Array, given_mm: Array, covarian
 
 def figure_plot(change: Figure) -> Markup:
     """Plot the given places, the change of each mark as a vector, and the 95 % ellipse around its end."""
-    radius, angles = svg.ellipse_axes(change.mark_covariances_um2)
+    at = np.arange(len(change.ids))
+    radius, angles = svg.ellipse_axes(change.covariance_um2.reshape(len(at), 2, len(at), 2)[at, :, at, :])
     reach = np.hypot(*change.change_um.T) + radius.max(axis=1)
     px_per_um = svg.round_step(LONGEST_PX / float(reach.max())) if reach.max() > 0.0 else 1.0
     low, high = change.given_mm.min(axis=0), change.given_mm.max(axis=0)

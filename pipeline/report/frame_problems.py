@@ -1,7 +1,7 @@
 """Problems of the measurement of frames that need a look before any adjustment, and the test for pixel locking."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -112,38 +112,15 @@ def fraction_test(position_px: Array) -> FractionTest:
     return FractionTest(counts, float(chdtrc(BINS - 1, chi_square)), float(harmonic / (2.0 * np.pi)))
 
 
-def expected_range(total: int) -> tuple[float, float]:
-    """99 % interval of the count of a bin without pixel locking (binomial distribution)."""
-    if total == 0:
-        return 0.0, 0.0
-    low, high = np.ceil(bdtrik((0.005, 0.995), total, 1.0 / BINS))
-    return float(low), float(high)
-
-
 def fraction_plot(axis: str, test: FractionTest) -> Markup:
-    """Plot the histogram over the pixel with the 99 % interval of the counts."""
+    """Plot the histogram over the pixel with the 99 % interval of the counts without pixel locking (binomial
+    distribution)."""
     total = int(test.counts.sum())
-    low, high = expected_range(total)
+    low, high = np.ceil(bdtrik((0.005, 0.995), total, 1.0 / BINS)).tolist() if total else (0.0, 0.0)
     axes = svg.Axes((-0.5, 0.5), (0.0, 1.15 * max(float(test.counts.max()), high, 1.0)), width=330.0, height=220.0)
     edges = np.linspace(-0.5, 0.5, BINS + 1)
-    band = svg.tag(
-        "rect",
-        x=axes.left,
-        y=float(axes.y(high)),
-        width=axes.width - axes.left - axes.right,
-        height=float(axes.y(low) - axes.y(high)),
-        class_="expected",
-    )
-    bars = _columns(axes, edges, test.counts)
-    label = f"{axis} position less the pixel's centre (px)"
-    title = f"Histogram of the fractional parts of the {axis} positions"
-    return svg.picture(axes.width, axes.height, title, *bars, band, axes.grid(label, "marks"))
-
-
-def _columns(axes: svg.Axes, edges: Array, counts: NDArray[np.int64]) -> Iterator[Markup]:
-    total = int(counts.sum())
-    for left, right, count in zip(edges[:-1], edges[1:], counts.tolist(), strict=True):
-        yield svg.tag(
+    bars = [
+        svg.tag(
             "rect",
             svg.tag("title", f"{count} of {total}"),
             x=float(axes.x(left)) + 1.0,
@@ -152,6 +129,19 @@ def _columns(axes: svg.Axes, edges: Array, counts: NDArray[np.int64]) -> Iterato
             height=float(axes.y(0.0) - axes.y(count)),
             class_="column",
         )
+        for left, right, count in zip(edges[:-1], edges[1:], test.counts.tolist(), strict=True)
+    ]
+    band = svg.tag(
+        "rect",
+        x=axes.left,
+        y=float(axes.y(high)),
+        width=axes.width - axes.left - axes.right,
+        height=float(axes.y(low) - axes.y(high)),
+        class_="expected",
+    )
+    label = f"{axis} position less the pixel's centre (px)"
+    title = f"Histogram of the fractional parts of the {axis} positions"
+    return svg.picture(axes.width, axes.height, title, *bars, band, axes.grid(label, "marks"))
 
 
 def single_frame_problems(frame: Frame) -> Iterator[Problem]:
@@ -184,15 +174,6 @@ def gather(gathered: Gathered, image: str, problems: Iterable[Problem]) -> None:
         known.differ |= problem.what != known.first.what
 
 
-def images_by_sentence(shots: list[Frame], evidence: Callable[[Frame], Iterable[str]]) -> dict[str, list[str]]:
-    """Names of frames by the sentences of evidence."""
-    images: dict[str, list[str]] = {}
-    for frame in shots:
-        for sentence in evidence(frame):
-            images.setdefault(sentence, []).append(frame.image)
-    return images
-
-
 def _assumed_pose(frame: Frame) -> Iterator[Problem]:
     pose = frame.scan.frame.pose if frame.scan else None
     if not pose or pose.decided:
@@ -217,10 +198,9 @@ def _other_problems(frame: Frame) -> Iterator[Problem]:
 
 
 def _measurement_problems(frame: Frame) -> Iterator[Problem]:
-    measured = frame.scan.frame if frame.scan else None
-    pose = measured.pose if measured else None
+    pose, problems = (frame.scan.frame.pose, frame.scan.frame.problems) if frame.scan else (None, ())
     evidence = pose.evidence if pose and not pose.decided else ()
-    for problem in measured.problems if measured else ():
+    for problem in problems:
         if problem not in evidence:
             yield Problem(drop_file_name(problem, frame.scan.scan) if frame.scan else problem)
     doubtful = [mark for mark in frame.marks if mark.needs_review]
@@ -241,7 +221,6 @@ def _measurement_problems(frame: Frame) -> Iterator[Problem]:
         )
     targets = [mark for mark in frame.marks if not mark.is_fiducial]
     is_lost = frame.scan is not None and frame.scan.failure is not None
-    problems = measured.problems if measured else ()
     is_explained = any({Code.COPY, Code.NO_BOARD} & {*problem.codes} for problem in problems)
     if targets and not is_lost and not is_explained and not any(mark.status.is_observation for mark in targets):
         yield Problem(

@@ -2,8 +2,7 @@
 
 import base64
 import math
-from collections import defaultdict
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -14,11 +13,10 @@ from numpy.typing import NDArray
 from measure.annotations.lines import Line
 from measure.flags import Status
 from measure.geometry import UP_FROM_CAMERA
-from measure.results import Covariance
 from pipeline.drawing import svg
 from pipeline.report import vectors
 from pipeline.report.data import Frame, Mark, ReportData
-from pipeline.report.numbers import fixed
+from pipeline.report.numbers import fixed, fixed_list
 from pipeline.report.vectors import LEAST_UM
 from pipeline.report.verdict import suspect_rows
 from pipeline.results.adjustment_record import ImageRecord
@@ -26,6 +24,7 @@ from pipeline.results.assessment_record import ResidualRecord
 from pipeline.results.image_unit import ImageUnit
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.results.thumbnail import Thumbnail, stretch
+from pipeline.types import Array
 
 SIZE_PX = 92.0  # a picture's width and height on the page
 TARGETS = 600  # largest number of target pictures; beyond it only the worst of each frame are shown
@@ -36,7 +35,6 @@ ARROW_PX = 34.0  # px, longest arrow
 _WIDTH_PX = 1000.0  # px; data plates 20 mm wide on film of 230 mm remain legible
 _LEAST_PX = 7.0  # px, smallest letters
 LARGE_W = 3.0  # standardised residual above which a mark needs a look
-MOST_CARDS = 60  # largest number of marks that need a look
 PLOT_PX = 330.0
 LONGEST_VECTOR_PX = 42.0
 _LEAST_PART = 0.1  # share of the variance above which a cause is listed
@@ -46,18 +44,12 @@ def shown_marks(shots: list[Frame]) -> dict[str, list[Mark]]:
     """Select the marks of each frame that get a picture: all fiducials, and all targets or the worst of them."""
     targets = sum(not mark.is_fiducial for frame in shots for mark in frame.marks)
     most = targets if targets <= TARGETS else max(LEAST_TARGETS, TARGETS // len(shots))
-    return {frame.image: _worst(frame, most) for frame in shots}
-
-
-def stored_px(shown: dict[str, list[Mark]]) -> float:
-    """Largest stored width of a picture."""
-    return SIZE_PX if sum(len(marks) for marks in shown.values()) <= PICTURES else 0.5 * SIZE_PX
-
-
-def _worst(frame: Frame, most: int) -> list[Mark]:
-    targets = sorted((mark for mark in frame.marks if not mark.is_fiducial), key=_badness, reverse=True)[:most]
-    chosen = {mark.point for mark in targets}
-    return [mark for mark in frame.marks if mark.is_fiducial or mark.point in chosen]
+    shown = {}
+    for frame in shots:
+        worst = sorted((mark for mark in frame.marks if not mark.is_fiducial), key=_badness, reverse=True)[:most]
+        chosen = {mark.point for mark in worst}
+        shown[frame.image] = [mark for mark in frame.marks if mark.is_fiducial or mark.point in chosen]
+    return shown
 
 
 def _badness(mark: Mark) -> tuple[bool, bool, float]:
@@ -72,18 +64,24 @@ def arrow_scale(shots: list[Frame]) -> float:
 
 
 def mark_picture(mark: Mark, thumbnail: Thumbnail, px_per_um: float, most_px: float) -> Markup:
-    """Draw the picture with a crosshair at the measured centre and the residual as an arrow."""
+    """Draw the picture with a crosshair at the measured centre, dashed if the mark is not an observation, and the
+    residual as an arrow."""
     rows, cols = thumbnail.pixels.shape
     zoom = SIZE_PX / (max(rows, cols) * thumbnail.step_px)  # page pixels to a pixel of the scan
     width, height = cols * thumbnail.step_px * zoom, rows * thumbnail.step_px * zoom
     image = svg.tag("image", href=_png_uri(thumbnail.pixels, most_px), width=width, height=height, class_="chip")
-    overlay = Markup("")
+    drawn = [image]
     if mark.center_px is not None:
         # The centre of the top-left thumbnail pixel lies half a thumbnail pixel inside the picture's edge.
-        x, y = (mark.center_px - thumbnail.origin_px + 0.5 * thumbnail.step_px) * zoom
-        overlay = _crosshair(x, y, mark) + (_arrow(x, y, mark.residual, px_per_um) if mark.residual else Markup(""))
+        center = (mark.center_px - thumbnail.origin_px + 0.5 * thumbnail.step_px) * zoom
+        ends = np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
+        starts, stops = center + 5.0 * ends, center + 17.0 * ends
+        class_ = "hair" if mark.status.is_observation else "hair guess"
+        drawn += [svg.strokes(starts, stops, "halo"), svg.strokes(starts, stops, class_)]
+        if mark.residual:
+            drawn.append(_arrow(center, mark.residual, px_per_um))
     title = f"{mark.kind} {mark.point} in {mark.image}, {mark.status}: the scan about its measured centre"
-    return svg.picture(SIZE_PX, SIZE_PX, title, image, overlay, class_="thumb")
+    return svg.picture(SIZE_PX, SIZE_PX, title, *drawn, class_="thumb")
 
 
 def _png_uri(pixels: NDArray[np.generic], most_px: float) -> str:
@@ -96,19 +94,10 @@ def _png_uri(pixels: NDArray[np.generic], most_px: float) -> str:
     return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode("ascii")
 
 
-def _crosshair(x: float, y: float, mark: Mark) -> Markup:
-    """Draw four ticks that leave the centre visible; dashed if the mark is not an observation."""
-    ends = np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
-    starts, stops = (np.array([x, y]) + px * ends for px in (5.0, 17.0))
-    class_ = "hair" if mark.status.is_observation else "hair guess"
-    return svg.strokes(starts, stops, "halo") + svg.strokes(starts, stops, class_)
-
-
-def _arrow(x: float, y: float, residual: ResidualRecord, px_per_um: float) -> Markup:
+def _arrow(start: Array, residual: ResidualRecord, px_per_um: float) -> Markup:
     """Draw the residual from the measured centre; comparator y points up, rows point down."""
     v = px_per_um * np.array([residual.vx_um, -residual.vy_um])
     length = float(np.hypot(*v))
-    start = np.array([x, y])
     end = start + v
     shaft = svg.strokes(start[None], end[None], "arrow")
     if length < 4.0:
@@ -207,70 +196,62 @@ def frame_views(data: ReportData, shots: list[Frame], every_mark: bool = False) 
     """Views of all frames, the worst first, drawn to common scales. every_mark: show all marks, whatever their
     number."""
     shown = {frame.image: list(frame.marks) for frame in shots} if every_mark else shown_marks(shots)
-    px_per_um, most_px = arrow_scale(shots), stored_px(shown)
-    by_image = residuals_by_image(data)
+    px_per_um = arrow_scale(shots)
+    most_px = SIZE_PX if sum(len(marks) for marks in shown.values()) <= PICTURES else 0.5 * SIZE_PX
+    residuals = data.adjustment.residuals if data.adjustment else ()
+    vectors_px_per_um = vectors.VectorField.from_residuals(residuals).scale(LONGEST_VECTOR_PX) if residuals else 1.0
     suspects = suspect_rows(data.adjustment) if data.adjustment else frozenset[ResidualRecord]()
-    plots = _plots(data, by_image, suspects, [frame.image for frame in shots if frame.image in by_image])
-
-    def card(mark: Mark) -> Card:
-        thumbnail = data.thumbnail(mark.image, mark.point, mark.kind) if data.thumbnail else None
-        picture = mark_picture(mark, thumbnail, px_per_um, most_px) if thumbnail else None
-        return Card(mark, picture, _causes(mark.covariance), mark.residual in suspects, data.unit_of_image(mark.image))
-
-    views = [
-        FrameView(
-            id=f"frame-{number}",
-            frame=frame,
-            unit=data.unit_of_image(frame.image),
-            fiducials=_observed_share([mark for mark in frame.marks if mark.is_fiducial]),
-            targets=_observed_share([mark for mark in frame.marks if not mark.is_fiducial]),
-            rms=_rms(by_image.get(frame.image, []), data.unit_of_image(frame.image)),
-            largest_w=max((abs(row.w) for row in by_image.get(frame.image, ()) if np.isfinite(row.w)), default=None),
-            cards=tuple(map(card, shown[frame.image])),
-            plot=plots.get(frame.image),
-            writing=writing_picture(frame.scan),
-            stored=data.adjustment.images.get(frame.image) if data.adjustment else None,
+    views = []
+    for number, frame in enumerate(shots, 1):
+        rows, unit = data.residuals_by_image.get(frame.image, []), data.unit_of_image(frame.image)
+        rms = unit.per_um * np.sqrt(np.mean(np.square([row.v_um for row in rows]), axis=0)) if rows else None
+        views.append(
+            FrameView(
+                id=f"frame-{number}",
+                frame=frame,
+                unit=unit,
+                fiducials=_observed_share([mark for mark in frame.marks if mark.is_fiducial]),
+                targets=_observed_share([mark for mark in frame.marks if not mark.is_fiducial]),
+                rms=None if rms is None else (float(rms[0]), float(rms[1])),
+                largest_w=max((abs(row.w) for row in rows if np.isfinite(row.w)), default=None),
+                cards=tuple(_card(data, mark, px_per_um, most_px, suspects) for mark in shown[frame.image]),
+                plot=_residual_plot(data, frame.image, rows, vectors_px_per_um, suspects) if rows else None,
+                writing=writing_picture(frame.scan),
+                stored=data.adjustment.images.get(frame.image) if data.adjustment else None,
+            )
         )
-        for number, frame in enumerate(shots, 1)
-    ]
     return sorted(views, key=lambda view: view.badness, reverse=True)
 
 
-def cards_to_show(views: Iterable[FrameView]) -> tuple[list[Card], int]:
-    """Cards of marks that need a look, those of the worst frame first, and the number of further ones."""
-    cards = [card for view in views for card in view.cards if card.needs_review]
-    return cards[:MOST_CARDS], len(cards[MOST_CARDS:])
-
-
-def residuals_by_image(data: ReportData) -> dict[str, list[ResidualRecord]]:
-    rows: dict[str, list[ResidualRecord]] = defaultdict(list)
-    for row in data.adjustment.residuals if data.adjustment else ():
-        rows[row.image].append(row)
-    return dict(rows)
-
-
-def _plots(
-    data: ReportData, by_image: dict[str, list[ResidualRecord]], suspects: Collection[ResidualRecord], images: list[str]
-) -> dict[str, Markup]:
-    stored = data.adjustment
-    if stored is None or not by_image:
-        return {}
-    scale = vectors.VectorField.from_residuals(stored.residuals).scale(LONGEST_VECTOR_PX)
-
-    def plot(image: str) -> Markup:
-        places, unit = vectors.VectorField.from_residuals(by_image[image]).places_mm, data.unit_of_image(image)
-        on = vectors.plane(places, data.frame_mm.get(stored.image_camera(image)), PLOT_PX, unit)
-        return vectors.image_plot(image, by_image[image], on, scale, suspects)
-
-    return {image: plot(image) for image in images}
-
-
-def _causes(covariance: Covariance | None) -> tuple[tuple[str, str, str], ...]:
-    sigmas = {} if covariance is None else covariance.sigmas_px
+def _card(data: ReportData, mark: Mark, px_per_um: float, most_px: float, suspects: Collection[ResidualRecord]) -> Card:
+    thumbnail = data.thumbnail(mark.image, mark.point, mark.kind) if data.thumbnail else None
+    picture = mark_picture(mark, thumbnail, px_per_um, most_px) if thumbnail else None
+    sigmas = {} if mark.covariance is None else mark.covariance.sigmas_px
     least = _LEAST_PART * sum(sigma**2 for sigma in sigmas.values())
     parts = [(cause, sigma) for cause, sigma in sigmas.items() if sigma**2 >= least]
-    named = tuple((cause.shown, fixed(sigma, 3), cause.meaning) for cause, sigma in parts)
-    return named if len(named) > 1 else ()
+    causes = tuple((cause.shown, fixed(sigma, 3), cause.meaning) for cause, sigma in parts)
+    is_suspect, unit = mark.residual in suspects, data.unit_of_image(mark.image)
+    return Card(mark, picture, causes if len(causes) > 1 else (), is_suspect, unit)
+
+
+def _residual_plot(
+    data: ReportData,
+    image: str,
+    rows: Sequence[ResidualRecord],
+    px_per_um: float,
+    suspects: Collection[ResidualRecord],
+) -> Markup:
+    """Plot the residuals of one image, each with its name and numbers as a tooltip."""
+    field, unit = vectors.VectorField.from_residuals(rows), data.unit_of_image(image)
+    frame_mm = data.frame_mm.get(data.adjustment.image_camera(image)) if data.adjustment else None
+    on = vectors.plane(field.places_mm, frame_mm, PLOT_PX, unit)
+    marks = []
+    for start, end, row in zip(*field.ends(on, px_per_um), rows, strict=True):
+        kind = "suspect" if row in suspects else "fiducial" if row.kind == "fiducial" else "target"
+        v = fixed_list((unit.per_um * v for v in row.v_um), unit.decimals, sign=True)
+        hint = f"{row.kind} {row.point}: v = ({v}) {unit.short_name} in the scan, w = {fixed(row.w, 1)}"
+        marks.append(svg.tag("g", svg.tag("title", hint), vectors.strokes_and_dots(start[None], end[None], kind)))
+    return on.picture(f"Residual vectors of {image}", px_per_um, *marks)
 
 
 def _observed_share(marks: list[Mark]) -> str:
@@ -281,10 +262,3 @@ def _observed_share(marks: list[Mark]) -> str:
     observed = counts[Status.MEASURED] + counts[Status.WEAK]
     others = ", ".join(f"{n} {status}" for status, n in counts.items() if n and status is not Status.MEASURED)
     return f"{observed} of {len(marks)}" + (f" ({others})" if others else "")
-
-
-def _rms(residuals: list[ResidualRecord], unit: ImageUnit) -> tuple[float, float] | None:
-    if not residuals:
-        return None
-    x, y = unit.per_um * np.sqrt(np.mean(np.square([row.v_um for row in residuals]), axis=0))
-    return float(x), float(y)

@@ -118,7 +118,10 @@ def certificate(lens: Lens, largest_radius_mm: float) -> CertificateTable:
     calibrated, high, low = balanced_distance(radius, tangent)
     calibrated_by = -calibrated * (by[high] + by[low]) / (tangent[high] + tangent[low])
     near = float(radius[0] / tangent[0])
-    angles = _angles_deg(float(np.degrees(np.arctan(tangent[-1]))))
+    largest_deg = float(np.degrees(np.arctan(tangent[-1])))
+    angles = [angle for angle in ANGLES_DEG if angle <= largest_deg]
+    if len(angles) < _FEWEST_ANGLES:  # a narrow camera: equal steps, rounded down to tenths
+        angles = (np.floor(10.0 * np.linspace(0.0, largest_deg, len(ANGLES_DEG) + 1)[1:]) / 10.0).tolist()
     at = np.tan(np.radians(angles))
     radii = np.interp(at, tangent, radius)
     by_at = np.stack([np.interp(at, tangent, column) for column in by.T], axis=1)
@@ -134,14 +137,6 @@ def certificate(lens: Lens, largest_radius_mm: float) -> CertificateTable:
     values = zip((1e3 * (radii - calibrated * at)).tolist(), (1e3 * np.array(sigmas[2:])).tolist(), strict=True)
     rows = [CertificateRow(*each) for each in zip(angles, radii.tolist(), values, asymmetric, strict=True)]
     return CertificateTable((calibrated, sigmas[0]), (near, sigmas[1]), largest_radius_mm, rows)
-
-
-def _angles_deg(largest: float) -> list[float]:
-    """ANGLES_DEG within the frame; for a narrower camera six equal steps, rounded down to tenths."""
-    usual = [angle for angle in ANGLES_DEG if angle <= largest]
-    if len(usual) >= _FEWEST_ANGLES:
-        return usual
-    return [float(each) for each in np.floor(10.0 * np.linspace(0.0, largest, len(ANGLES_DEG) + 1)[1:]) / 10.0]
 
 
 def lens_map(lens: Lens, on: Plane, observed_radius_mm: float = np.inf) -> LensMap:
@@ -194,20 +189,17 @@ def curves_plot(drawn: Curves, observed_radius_mm: float, unit: ImageUnit = FILM
     axes = svg.Axes((0.0, float(radius[-1])), (low - room, high + room), width=width, height=0.75 * width)
     x = axes.x(radius)
     labels = axes.grid(f"radius from the principal point ({unit.long_name})", f"displacement ({unit.short_name})")
-    content = [_extrapolation(axes, unit.per_mm * observed_radius_mm), labels]
+    content = []
+    start, end = float(axes.x(min(unit.per_mm * observed_radius_mm, axes.x_range[1]))), axes.width - axes.right
+    if end - start >= 1.0:
+        height = axes.height - axes.bottom - axes.top
+        content.append(svg.tag("rect", x=start, y=axes.top, width=end - start, height=height, class_="beyond"))
+        if end - start > 90.0:
+            content.append(svg.words(end - 6.0, axes.top + 14.0, "no targets here", "tick", "end"))
+    content.append(labels)
     for kind, (value, sigma) in curve_of.items():
         for half in (BAND * sigma, sigma) if kind == "first" else (BAND * sigma,):
             edge = np.concatenate([axes.y(value + half), axes.y(value - half)[::-1]])
             content.append(svg.line(np.concatenate([x, x[::-1]]), edge, f"band {kind}", closed=True))
         content.append(svg.line(x, axes.y(value), f"curve {kind}"))
     return svg.picture(axes.width, axes.height, "Distortion over the radius with its 95 % band", *content)
-
-
-def _extrapolation(axes: svg.Axes, observed_radius: float) -> Markup:
-    start, end = float(axes.x(min(observed_radius, axes.x_range[1]))), axes.width - axes.right
-    if end - start < 1.0:
-        return Markup("")
-    height = axes.height - axes.bottom - axes.top
-    words = [svg.words(end - 6.0, axes.top + 14.0, "no targets here", "tick", "end")] if end - start > 90.0 else []
-    ground = svg.tag("rect", x=start, y=axes.top, width=end - start, height=height, class_="beyond")
-    return Markup("").join([ground, *words])

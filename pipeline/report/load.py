@@ -15,7 +15,7 @@ from measure.flags import Status
 from pipeline.archive import made_from as provenance
 from pipeline.archive.checked_results import Judging, measured_scans, stored_judging, written_judging
 from pipeline.archive.review_decisions import inapplicable
-from pipeline.archive.verdicts import Verdict, scan_counts
+from pipeline.archive.verdicts import Verdict
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
@@ -24,7 +24,6 @@ from pipeline.publishing import outside_note
 from pipeline.report import frame_problems
 from pipeline.report.data import Frame, FrameTotals, Problem, ReportData, frames
 from pipeline.report.frame_problems import centers_px
-from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.verdict import suspect_rows
 from pipeline.results.adjustment_file import read_adjustment, read_covariance
 from pipeline.results.comparator_file import (
@@ -42,8 +41,7 @@ from pipeline.text.wording import counted, did_you_mean, listed
 
 MOST_FRAMES = 200  # largest number of frames shown with their marks
 _MOST_PROBLEMS = 50  # largest number of different problems listed
-_ROWS = 200  # largest number of rows (camera and kind of file)
-_BEST_FIRST = (Verdict.GOOD, Verdict.DECIDED, Verdict.LOOK, Verdict.POOR, Verdict.FAILED)
+BEST_FIRST = (Verdict.GOOD, Verdict.DECIDED, Verdict.LOOK, Verdict.POOR, Verdict.FAILED)
 _OBSERVED = {str(status) for status in Status if status.is_observation}
 
 
@@ -59,8 +57,13 @@ class _FrameCounts:
 
     @property
     def totals(self) -> FrameTotals:
+        ordered = sorted(self.gathered.values(), key=lambda each: -len(each.images))
+        problems = [each.together() for each in ordered[:_MOST_PROBLEMS]]
+        if rest := sum(len(each.images) for each in ordered[_MOST_PROBLEMS:]):
+            what = f"{counted(rest, 'more problem')} of frames, all different."
+            problems.append(Problem(what, "`reseau status --csv` has them."))
         places = frame_problems.places_apart(np.array(self.centers_px))
-        return FrameTotals(self.marks, self.of_targets, self.verdicts, tuple(_listed(self.gathered)), places)
+        return FrameTotals(self.marks, self.of_targets, self.verdicts, tuple(problems), places)
 
     def add(self, frame: Frame, kind: tuple[str, str], verdict: Verdict, problems: Iterable[Problem]) -> None:
         self.verdicts[kind][verdict] += 1
@@ -111,7 +114,7 @@ def reduced(
             counts.add(frame, kind, verdict, problems)
             if problems or verdict.needs_review or frame.image in suspect:
                 largest_w = max((abs(mark.w or 0.0) for mark in frame.marks), default=0.0)
-                yield (-_BEST_FIRST.index(verdict), -largest_w), one
+                yield (-BEST_FIRST.index(verdict), -largest_w), one
 
     shown = [one for _, one in nsmallest(MOST_FRAMES, frames_to_show(), key=itemgetter(0))]
     return replace(
@@ -131,12 +134,12 @@ def _one_by_one(data: ReportData, scans: Iterable[MeasuredScan]) -> Iterator[Rep
     rows: dict[str, list[ComparatorPoint]] = defaultdict(list)
     for row in data.comparator:
         rows[row.image].append(row)
-    residuals, others = residuals_by_image(data), data.adjustment.images if data.adjustment else {}
+    others = data.adjustment.images if data.adjustment else {}
     shown = set[str]()
 
     def frame_data(image: str, scan: MeasuredScan | None) -> ReportData:
-        images = {name: known for name, known in [(image, others.get(image))] if known is not None}
-        rows_of = tuple(residuals.get(image, ()))
+        images = {image: others[image]} if image in others else {}
+        rows_of = tuple(data.residuals_by_image.get(image, ()))
         own = replace(data.adjustment, images=images, residuals=rows_of) if data.adjustment else None
         return replace(
             data, comparator=rows.get(image, []), measurement={image: scan} if scan else {}, adjustment=own, totals=None
@@ -148,30 +151,6 @@ def _one_by_one(data: ReportData, scans: Iterable[MeasuredScan]) -> Iterator[Rep
             yield frame_data(scan.frame.image, scan)
     for image in sorted({*rows, *others} - shown):
         yield frame_data(image, None)
-
-
-def _listed(problems: frame_problems.Gathered) -> Iterator[Problem]:
-    """Yield problems, those of most frames first."""
-    ordered = sorted(problems.values(), key=lambda each: -len(each.images))
-    yield from (each.together() for each in ordered[:_MOST_PROBLEMS])
-    rest = sum(len(each.images) for each in ordered[_MOST_PROBLEMS:])
-    if rest:
-        yield Problem(f"{counted(rest, 'more problem')} of frames, all different.", "`reseau status --csv` has them.")
-
-
-def totals_view(data: ReportData, shots: Sequence[Frame]) -> Mapping[str, object] | None:
-    """Totals for the template, if the report does not show all frames or only fiducials were adjusted; else None."""
-    if data.totals is None and not data.is_film_alone:
-        return None
-    counts, total = verdict_counts(data, shots), frame_counts(data, shots)
-    return {
-        "sentence": f"{scan_counts(total)}.",
-        "shown": len({*(data.measurement or {}), *(row.image for row in data.comparator)}) if data.totals else None,
-        "verdicts": [each for each in _BEST_FIRST if total[each]],
-        "rows": sorted(counts.items())[:_ROWS],
-        "left_out": max(len(counts) - _ROWS, 0),
-        "all": total,
-    }
 
 
 def frame_counts(data: ReportData, shots: Sequence[Frame]) -> Counter[Verdict]:

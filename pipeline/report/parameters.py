@@ -13,7 +13,6 @@ from adjust.quality.significance import LEVEL
 from pipeline.report.data import ReportData
 from pipeline.report.lens import largest_effects_um, lens
 from pipeline.report.numbers import fixed, significant, value_and_sigma
-from pipeline.results.adjustment_file import Covariance
 from pipeline.results.adjustment_record import CameraRecord, GivenQuantity, GroupTestRecord, Quantity
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit, pixel_intrinsics
 from pipeline.text.wording import capitalised
@@ -29,8 +28,6 @@ INTERIOR_MEANING = {
     "cy": "principal point, row",
 }
 SYMBOLS = {"x0": "x₀′", "y0": "y₀′"}
-LARGER = 1.5  # ratio of standard deviations that a dozen images rarely exceed by chance
-
 MOSTLY_PRIOR = 0.9  # fraction of the prior sigma above which the observations have contributed little
 
 
@@ -69,35 +66,21 @@ def camera_values(data: ReportData, name: str) -> list[CameraValue]:
     keys = [Parameter.interior(name, key) for key in known]
     sigmas = np.array([each.sigma for each in known.values()])
     model = np.diag(sigmas**2) if data.covariance is None else data.covariance.select(keys)
-    values, by_mm = _stated(camera, known, unit)
+    mm, family = {key: each.value for key, each in known.items()}, family_of(camera.distortion.family)
+    if unit.is_pixel and family.y_down:
+        values, by_mm = pixel_intrinsics(mm, 1.0 / unit.per_mm)
+    else:
+        scale = np.array([unit.per_mm if key in ("c", "x0", "y0") else 1.0 for key in mm])
+        values, by_mm = dict(zip(mm, (scale * list(mm.values())).tolist(), strict=True)), np.diag(scale)
     sigma = _sigmas(by_mm, model) if np.isfinite(sigmas).all() else np.abs(by_mm) @ sigmas
     if data.covariance is not None and data.covariance.clusters is not None:
         sigma = np.maximum(sigma, _sigmas(by_mm, data.covariance.clusters.select(keys)))
-    family = family_of(camera.distortion.family)
     units = [unit.long_name if name in INTERIOR_MEANING else family.unit(name) for name in values]
     return list(map(CameraValue, values, values.values(), sigma.tolist(), units))
 
 
-def _stated(camera: CameraRecord, known: Mapping[str, Quantity], unit: ImageUnit) -> tuple[dict[str, float], Array]:
-    """Values by name in this unit, and their derivatives with respect to the values in mm."""
-    mm = {key: each.value for key, each in known.items()}
-    if unit.is_pixel and family_of(camera.distortion.family).y_down:
-        return pixel_intrinsics(mm, 1.0 / unit.per_mm)
-    scale = np.array([unit.per_mm if key in ("c", "x0", "y0") else 1.0 for key in mm])
-    return dict(zip(mm, (scale * list(mm.values())).tolist(), strict=True)), np.diag(scale)
-
-
 def _sigmas(by_mm: Array, covariance: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(np.diagonal(by_mm @ covariance @ by_mm.T), 0.0)))
-
-
-def cluster_ratio(name: str, camera: CameraRecord, covariance: Covariance | None) -> float:
-    """Largest ratio of the standard deviations by leaving out images to those of the adjustment; 0 if unknown."""
-    keys = [key for key, each in camera.interior.items() if each.sigma > 0.0]
-    if covariance is None or covariance.clusters is None or not keys:
-        return 0.0
-    scatter = np.diagonal(covariance.clusters.select(Parameter.interior(name, key) for key in keys))
-    return float((np.sqrt(scatter) / [camera.interior[key].sigma for key in keys]).max())
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from adjust.display import CameraPlots
 from adjust.errors import AdjustmentError
 from pipeline.errors import InputError, missing_extra
 from pipeline.report.data import ReportData
-from pipeline.report.frame_views import residuals_by_image
 from pipeline.report.lens import lens
 from pipeline.results.adjustment_record import CameraRecord
 from pipeline.text.files import atomic_path, file_word
@@ -72,10 +71,9 @@ def calibrated_cameras(data: ReportData) -> Iterator[tuple[CameraPlots, CameraRe
     stored, covariance = data.adjustment, data.covariance
     if stored is None or covariance is None or not stored.converged:
         return
-    by_image = residuals_by_image(data)
     for name, record in stored.cameras.items():
         images = stored.camera_images(name)
-        rows = [row for image in images for row in by_image.get(image, []) if row.kind != "join"]
+        rows = [row for image in images for row in data.residuals_by_image.get(image, []) if row.kind != "join"]
         is_fiducial = np.array([row.kind == "fiducial" for row in rows], dtype=bool)
         if not record.is_calibrated or is_fiducial.all():
             continue

@@ -1,9 +1,8 @@
 """Plots over the camera frame: vectors (residuals, partial scans, distortion, scanner), coverage, and contours."""
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import numpy as np
 from markupsafe import Markup
@@ -11,8 +10,6 @@ from skimage.measure import find_contours
 
 from adjust.display import CELLS
 from pipeline.drawing import svg
-from pipeline.report.numbers import fixed, fixed_list
-from pipeline.results.adjustment_record import JoinedFrameRecord, JoinRecord
 from pipeline.results.assessment_record import ResidualRecord
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.types import Array, Mask
@@ -20,8 +17,6 @@ from pipeline.types import Array, Mask
 MARGIN_PX = 26.0
 FOOT_PX = 30.0
 LEAST_UM = 0.01  # µm, smallest residual that sets the scale: without redundancy residuals are rounding errors
-JOINED_PLOT_PX = 420.0
-LONGEST_JOIN_PX = 40.0
 
 LEVELS = 7  # approximate number of contours
 LABEL_ROOM_PX = 46.0  # px, smallest distance between contour labels
@@ -78,12 +73,6 @@ class VectorField:
         places, vectors = np.hsplit(np.array(numbers, dtype=float).reshape(-1, 4), 2)
         return cls(places, vectors, np.array([row.kind == "fiducial" for row in rows], dtype=bool))
 
-    @classmethod
-    def from_joins(cls, rows: Sequence[JoinRecord]) -> "VectorField":
-        """Differences between two partial scans of a frame."""
-        places, vectors = np.hsplit(np.array([(row.x_mm, row.y_mm, row.dx_um, row.dy_um) for row in rows]), 2)
-        return cls(places, vectors, np.zeros(len(rows), dtype=bool))
-
     def scale(self, longest_px: float) -> float:
         """Page pixels per µm, a round number: the 99th percentile of the lengths is drawn `longest_px` long at most."""
         length = float(np.percentile(np.hypot(*self.vectors_um.T), 99.0))
@@ -127,20 +116,6 @@ def longest_vector(vectors_um: Array, covariances_um2: Array) -> tuple[float, fl
     return float(size[at]), float(np.sqrt(max(along @ covariances_um2[at] @ along, 0.0)))
 
 
-def image_plot(
-    image: str, rows: Sequence[ResidualRecord], on: Plane, px_per_um: float, suspects: Collection[ResidualRecord]
-) -> Markup:
-    """Plot the residuals of one image, each with its name and numbers as a tooltip."""
-    residuals, unit = VectorField.from_residuals(rows), on.unit
-    marks = []
-    for start, end, row in zip(*residuals.ends(on, px_per_um), rows, strict=True):
-        kind = "suspect" if row in suspects else "fiducial" if row.kind == "fiducial" else "target"
-        v = fixed_list((unit.per_um * v for v in row.v_um), unit.decimals, sign=True)
-        hint = f"{row.kind} {row.point}: v = ({v}) {unit.short_name} in the scan, w = {fixed(row.w, 1)}"
-        marks.append(svg.tag("g", svg.tag("title", hint), strokes_and_dots(start[None], end[None], kind)))
-    return on.picture(f"Residual vectors of {image}", px_per_um, *marks)
-
-
 def all_images_plot(residuals: VectorField, on: Plane, px_per_um: float) -> Markup:
     """Plot the residuals of all images in one frame: a common pattern is due to the camera, not to the film."""
     starts, ends = residuals.ends(on, px_per_um)
@@ -153,22 +128,6 @@ def strokes_and_dots(starts: Array, ends: Array, kind: str, dots: Array | None =
     """Draw vectors with a dot at each start, or at the places `dots`."""
     at = starts if dots is None else dots
     return svg.strokes(starts, ends, f"vector {kind}") + svg.strokes(at, at, f"dot {kind}")
-
-
-def joined_view(frame: JoinedFrameRecord) -> SimpleNamespace:
-    """Frame scanned in parts for the template: RMS difference at tie points in x' and y', name and length of the
-    largest, and a plot."""
-    if not frame.joins:
-        return SimpleNamespace(record=frame, rms_um=(None, None), largest="–", plot=None)
-    apart = VectorField.from_joins(frame.joins)
-    lengths_um = np.hypot(*apart.vectors_um.T)
-    on = plane(apart.places_mm, None, JOINED_PLOT_PX)
-    return SimpleNamespace(
-        record=frame,
-        rms_um=np.sqrt(np.mean(apart.vectors_um**2, axis=0)).tolist(),
-        largest=f"{frame.joins[int(lengths_um.argmax())].point}: {fixed(float(lengths_um.max()), 1)} µm",
-        plot=all_images_plot(apart, on, apart.scale(LONGEST_JOIN_PX)),
-    )
 
 
 def coverage_counts(on: Plane, places_mm: Array) -> tuple[Array, Array, Array]:

@@ -2,19 +2,19 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from scipy.special import chdtri, ndtri
 
-from adjust.problem.parameter import description, parameter_from_text
+from adjust.problem.parameter import Parameter, description, parameter_from_text
 from measure.flags import Status
-from pipeline.report.data import Frame, MarkKey, Problem, ReportData, frames
-from pipeline.report.frame_problems import frame_problems, images_by_sentence, pixel_locking, places_px
+from pipeline.report.data import Frame, Problem, ReportData, frames
+from pipeline.report.frame_problems import frame_problems, pixel_locking, places_px
 from pipeline.report.numbers import fixed, value_and_sigma
-from pipeline.report.parameters import LARGER, camera_values, cluster_ratio, spoken_name
+from pipeline.report.parameters import camera_values, spoken_name
 from pipeline.results import assessment_record
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord
 from pipeline.results.stage_files import Check
@@ -24,7 +24,6 @@ Observed = (
     assessment_record.DistanceRecord | assessment_record.FiducialDistanceRecord | assessment_record.ObservedQuantity
 )
 Level = Literal["good", "look", "failed"]
-Evidence = Callable[[ReportData, list[Frame]], Iterable[Problem]]
 
 A_PRIORI = (
     "Standard deviations are a priori ones, as the given sigmas make them: the observations have no redundancy of "
@@ -37,6 +36,7 @@ LEAST_ALIKE, NEARLY_ALL = 6, 0.8  # number and share of suspects in one image fr
 MOST_QUANTITIES = 3  # largest number of contradicted quantities named
 LEAST_SHARE = 0.5  # fraction of the corner radius up to which a lens must be observed
 LOOSE = 0.01  # fraction of c, standard deviation above which images do not separate it from their distances
+LARGER = 1.5  # ratio of standard deviations that a dozen images rarely exceed by chance
 CONFIDENCE = 0.99  # of the global test, and family-wise confidence of the tests of residuals
 
 _CONTRADICTED_BY = "contradicted by the images (p < 0.01"
@@ -80,10 +80,37 @@ class ReportVerdict:
 def judge(data: ReportData) -> ReportVerdict:
     """Judge the available results: measurement, adjustment and check against OpenCV."""
     shots = frames(data)
-    problems = tuple(problem for found in NEEDS_A_LOOK.values() for problem in found(data, shots))
+    problems = tuple(problem for found in problems_by_test(data, shots).values() for problem in found)
     is_fatal = data.adjustment is not None and any(_no_solution(data.adjustment))
     level: Level = "failed" if is_fatal or not _observed(data, shots) else "look" if problems else "good"
     return ReportVerdict(level, _sentence(data, shots, level, len(problems)), problems, tuple(_notes(data, shots)))
+
+
+def problems_by_test(data: ReportData, shots: list[Frame]) -> dict[str, Iterable[Problem]]:
+    """What leads to exit code 1, by the names of the tests in docs/reference/results.md."""
+    stored, check, totals, solved = data.adjustment, data.check, data.totals, _solved(data)
+    unchecked = Problem(
+        "Nothing checks the result: there are as many unknowns as observations.",
+        "Add points or frames; until then no standard deviation here has been confirmed by the data.",
+    )
+    differs = Problem(
+        f"OpenCV's calibration of the same observations differs. {check.reason if check else ''}",
+        "See the table of the check: a parameter that differs by many standard deviations points to the cause.",
+        section="check",
+    )
+    return {
+        "solution": _no_solution(stored) if stored else (),
+        "made from": data.problems,
+        "frames": totals.problems if totals else frame_problems(shots),
+        "pixel locking": pixel_locking(totals.places_px if totals else places_px(shots)),
+        "warnings": map(Problem, stored.warnings if stored else ()),
+        "σ₀": _too_large(solved) if solved and solved.has_sigma0 else (),
+        "redundancy": [unchecked] if solved and solved.redundancy <= 0 else (),
+        "reach of the lens": _lens_problems(data, solved) if solved else (),
+        "distances, calibrations, antennas": _further_problems(solved) if solved else (),
+        "gross errors": _suspects(solved) if solved else (),
+        "OpenCV": [differs] if check and check.verdict == "differs" else (),
+    }
 
 
 def sigma0_bounds(redundancy: float) -> tuple[float, float]:
@@ -120,14 +147,6 @@ def _no_solution(adjustment: AdjustmentRecord) -> Iterator[Problem]:
         )
 
 
-def _unchecked(adjustment: AdjustmentRecord) -> Iterator[Problem]:
-    if adjustment.redundancy <= 0:
-        yield Problem(
-            "Nothing checks the result: there are as many unknowns as observations.",
-            "Add points or frames; until then no standard deviation here has been confirmed by the data.",
-        )
-
-
 def _suspects(adjustment: AdjustmentRecord) -> Iterator[Problem]:
     kept = [row for row in adjustment.suspects if not row.removed]
     given, marks = ([row for row in kept if (row.group in GIVEN) is is_given] for is_given in (True, False))
@@ -140,27 +159,24 @@ def _suspects(adjustment: AdjustmentRecord) -> Iterator[Problem]:
         remedy = (
             f"Nearly all are marks of {owners[0][0]}: look for wrong point numbers of the whole image, or exclude it."
         )
-    of_camera = "Correct the given value in the camera's file, or give it the standard deviation that it has."
-    for rows, what_to_do in ((marks, remedy), (given, of_camera)):
-        if rows:
-            yield Problem(
-                f"{counted(len(rows), 'gross error')} suspected: {listed(list(map(_suspect, rows)))}.",
-                what_to_do,
-                marks=_suspect_marks(rows),
-                section="reliability",
-            )
-    if removed := [row for row in adjustment.suspects if row.removed]:
-        yield Problem(
-            f"Left out as gross errors: {listed(list(map(_suspect, removed)))}.",
+    groups = (
+        (marks, f"{counted(len(marks), 'gross error')} suspected", remedy),
+        (
+            given,
+            f"{counted(len(given), 'gross error')} suspected",
+            "Correct the given value in the camera's file, or give it the standard deviation that it has.",
+        ),
+        (
+            [row for row in adjustment.suspects if row.removed],
+            "Left out as gross errors",
             "Look at the picture or the records, and reject or correct them there.",
-            marks=_suspect_marks(removed),
-            section="reliability",
-        )
-
-
-def _suspect_marks(rows: Sequence[assessment_record.SuspectRecord]) -> tuple[MarkKey, ...]:
-    """Keys of the suspects that are marks of a frame."""
-    return tuple((row.owner, row.group, row.point) for row in rows if row.group in ON_FRAMES)
+        ),
+    )
+    for rows, heading, what_to_do in groups:
+        if rows:
+            of_frames = tuple((row.owner, row.group, row.point) for row in rows if row.group in ON_FRAMES)
+            what = f"{heading}: {listed(list(map(_suspect, rows)))}."
+            yield Problem(what, what_to_do, marks=of_frames, section="reliability")
 
 
 def _suspect(row: assessment_record.SuspectRecord) -> str:
@@ -224,16 +240,6 @@ def _too_large(adjustment: AdjustmentRecord) -> Iterator[Problem]:
     )
 
 
-def _too_small(adjustment: AdjustmentRecord) -> Iterator[str]:
-    """Yield a note for a significantly small sigma0, which is harmless."""
-    low, _ = sigma0_bounds(adjustment.variance_factor.redundancy)
-    if adjustment.sigma0 < low:
-        yield (
-            f"{_sigma0_and('below', low, adjustment.sigma0)}: the marks fit better than the standard deviations given "
-            f"({_group_sigmas(adjustment)}), which may be lowered."
-        )
-
-
 def _group_sigmas(adjustment: AdjustmentRecord) -> str:
     groups = {name: group for name, group in adjustment.groups.items() if group.redundancy >= 1.0}
     return ", ".join(f"{name} {fixed(group.sigma0)}" for name, group in groups.items())
@@ -245,11 +251,10 @@ def _sigma0_and(side: str, bound: float, sigma0: float) -> str:
     return f"σ₀ = {sigma0:.{digits}f} is {side} {bound:.{digits}f}"
 
 
-def _lens_problems(data: ReportData) -> Iterator[Problem]:
+def _lens_problems(data: ReportData, solved: AdjustmentRecord) -> Iterator[Problem]:
     """Yield problems of lenses observed out to less than half the corner radius, and of principal distances that the
     images alone have to determine and hardly do."""
-    solved = _solved(data)
-    for name, camera in solved.cameras.items() if solved else ():
+    for name, camera in solved.cameras.items():
         c = camera.principal_distance_mm
         if not (c.given and math.isfinite(c.given.sigma)) and c.sigma > LOOSE * c.value:
             yield Problem(
@@ -272,15 +277,6 @@ def lens_sentences(data: ReportData) -> Iterator[tuple[str, str, float]]:
             yield name, known.sentence(name, data.unit_of_camera(name)), known.share
 
 
-def _check_problems(check: Check) -> Iterator[Problem]:
-    if check.verdict == "differs":
-        yield Problem(
-            f"OpenCV's calibration of the same observations differs. {check.reason}",
-            "See the table of the check: a parameter that differs by many standard deviations points to the cause.",
-            section="check",
-        )
-
-
 def _corners_notes(check: Check) -> Iterator[str]:
     """Yield notes comparing OpenCV's calibrations from its own board corners and from those measured here."""
     for name, camera in check.cameras.items():
@@ -299,22 +295,6 @@ def _corners_notes(check: Check) -> Iterator[str]:
 def _solved(data: ReportData) -> AdjustmentRecord | None:
     """The adjustment, if it has a solution."""
     return data.adjustment if data.adjustment and not any(_no_solution(data.adjustment)) else None
-
-
-# Checks that lead to exit code 1, by their names in docs/reference/results.md.
-NEEDS_A_LOOK: dict[str, Evidence] = {
-    "solution": lambda data, _: _no_solution(data.adjustment) if data.adjustment else (),
-    "made from": lambda data, _: data.problems,
-    "frames": lambda data, shots: data.totals.problems if data.totals else frame_problems(shots),
-    "pixel locking": lambda data, shots: pixel_locking(data.totals.places_px if data.totals else places_px(shots)),
-    "warnings": lambda data, _: map(Problem, data.adjustment.warnings if data.adjustment else ()),
-    "σ₀": lambda data, _: _too_large(solved) if (solved := _solved(data)) and solved.has_sigma0 else (),
-    "redundancy": lambda data, _: _unchecked(solved) if (solved := _solved(data)) else (),
-    "reach of the lens": lambda data, _: _lens_problems(data),
-    "distances, calibrations, antennas": lambda data, _: _further_problems(solved) if (solved := _solved(data)) else (),
-    "gross errors": lambda data, _: _suspects(solved) if (solved := _solved(data)) else (),
-    "OpenCV": lambda data, _: _check_problems(data.check) if data.check else (),
-}
 
 
 def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
@@ -337,14 +317,22 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
         yield from data.adjustment.notes
         yield from _unmodelled_notes(data, data.adjustment)
         yield from _weight_notes(data.adjustment)
-        if solved := _solved(data):
-            yield from _too_small(solved) if solved.has_sigma0 else (A_PRIORI,)
+        if (solved := _solved(data)) and not solved.has_sigma0:
+            yield A_PRIORI
+        elif solved and solved.sigma0 < (low := sigma0_bounds(solved.variance_factor.redundancy)[0]):
+            yield (
+                f"{_sigma0_and('below', low, solved.sigma0)}: the marks fit better than the standard deviations given "
+                f"({_group_sigmas(solved)}), which may be lowered."
+            )
     if data.is_film_alone:
         yield (
             "Fiducial marks are the same in every frame: if two scans bear each other's names, nothing here shows it."
         )
-    for note, images in images_by_sentence(shots, lambda frame: frame.scan.notes if frame.scan else ()).items():
-        yield f"{listed(images)}: {note}"
+    images_by_note: dict[str, list[str]] = {}
+    for frame in shots:
+        for note in frame.scan.notes if frame.scan else ():
+            images_by_note.setdefault(note, []).append(frame.image)
+    yield from (f"{listed(images)}: {note}" for note, images in images_by_note.items())
     for status in (Status.WEAK, Status.PREDICTED, Status.REJECTED):
         for kind, *words in (("target", "target"), ("tie", "tie-point observation")):
             number = (
@@ -358,8 +346,13 @@ def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
 
 def _unmodelled_notes(data: ReportData, adjustment: AdjustmentRecord) -> Iterator[str]:
     """Yield notes on sigmas added for unmodelled errors, and on correlated errors within images."""
+    clusters = data.covariance.clusters if data.covariance else None
     for name, sigma_mm in adjustment.unmodelled_mm.items():
-        unit, ratio = data.unit_of_camera(name), cluster_ratio(name, adjustment.cameras[name], data.covariance)
+        unit, ratio = data.unit_of_camera(name), 0.0
+        interior = adjustment.cameras[name].interior
+        sigmas = {Parameter.interior(name, key): each.sigma for key, each in interior.items() if each.sigma > 0.0}
+        if clusters is not None and sigmas:
+            ratio = float((np.sqrt(np.diagonal(clusters.select(sigmas))) / list(sigmas.values())).max())
         if sigma_mm > 0.0:
             yield (
                 f"{name}: {1e3 * sigma_mm * unit.per_um:.3g} {unit.short_name} are added to the standard deviations of "
@@ -374,8 +367,7 @@ def _unmodelled_notes(data: ReportData, adjustment: AdjustmentRecord) -> Iterato
 
 def _weight_notes(adjustment: AdjustmentRecord) -> Iterator[str]:
     """Yield notes on weights changed by robust estimation and variance components."""
-    lowered = [row for row in adjustment.residuals if row.weight < 1.0]
-    if lowered:
+    if lowered := [row for row in adjustment.residuals if row.weight < 1.0]:
         least = min(lowered, key=lambda row: row.weight)
         yield (
             f"Robust estimation lowered the weight of {counted(len(lowered), 'observation')}, most that of "
@@ -401,26 +393,19 @@ def _sentence(data: ReportData, shots: list[Frame], level: Level, problems: int)
     if level == "failed":
         why = "the network is singular" if data.adjustment.singular else "the iteration did not come to rest"
         return f"There is no calibration: {why}."
-    constants = [
-        f"{name} has {_focal_lengths(data, name)}"
-        for name, camera in data.adjustment.cameras.items()
-        if camera.is_calibrated
-    ]
+    constants = []
+    for name, camera in data.adjustment.cameras.items():
+        if camera.is_calibrated:
+            focal = [each for each in camera_values(data, name) if each.is_focal]
+            pairs = [" ± ".join(value_and_sigma(each.value, each.sigma)) for each in focal]
+            lengths = [f"{each.symbol} = {pair} {each.unit}" for each, pair in zip(focal, pairs, strict=True)]
+            constants.append(f"{name} has {', '.join(lengths).replace('± fixed', '(fixed)')}")
     if not constants:
         return f"Film transformations from {found}; no frame is oriented, and no camera calibrated{ending}"
     if not data.totals:
         used = {row.image for row in data.adjustment.residuals}
         found = f"{counted(len(data.adjustment.residuals), 'mark')} in {counted(len(used), 'frame')}"
     return f"Calibrated from {found}: {'; '.join(constants)}{ending}"
-
-
-def _focal_lengths(data: ReportData, camera: str) -> str:
-    shown = []
-    for each in camera_values(data, camera):
-        value, sigma = value_and_sigma(each.value, each.sigma)
-        if each.is_focal:
-            shown.append(f"{each.symbol} = {value} ± {sigma} {each.unit}".replace("± fixed", "(fixed)"))
-    return ", ".join(shown)
 
 
 def _observed(data: ReportData, shots: list[Frame]) -> int:

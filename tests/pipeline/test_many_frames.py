@@ -24,9 +24,8 @@ from pipeline.archive.thumbnails import Thumbnails, ThumbnailStore
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_undrawn
 from pipeline.report import ReportData, Thumbnail, judge, render_report
-from pipeline.report.frame_views import MOST_CARDS
 from pipeline.report.load import MOST_FRAMES, frame_counts, reduced, report_data
-from pipeline.report.page import render_frame_page
+from pipeline.report.page import MOST_CARDS, render_frame_page
 from pipeline.results.comparator_file import ComparatorPoint, read_measurement_hash, write_comparator
 from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan
 from pipeline.results.thumbnail import cut
