@@ -163,14 +163,11 @@ class Block:
     def lens_reach(self) -> dict[str, str]:
         """By camera, a sentence on the radius up to which its lens is known: beyond it, the exported lens is
         extrapolated."""
-        lenses = self.adjustment.estimated_lenses() if self.adjustment else ()
-        return {name: known.sentence(name, self._image_unit(name)) for name, known in lenses if known.share < 1.0}
-
-    def _image_unit(self, camera: str) -> ImageUnit:
-        """Pixels of a digital camera, whose pixel size may be no figure of its own; else mm and µm."""
+        # In pixels of a digital camera, whose pixel size may be no figure of its own.
         digital = (each for each in self.frames if each.model and each.model.film.transformation == "none")
-        pitch_um = next((each.pitch_um for each in digital if each.camera == camera and each.pitch_um), None)
-        return FILM_UNIT if pitch_um is None else ImageUnit(min(pitch_um))
+        units = {each.camera: ImageUnit(min(each.pitch_um)) for each in reversed(list(digital)) if each.pitch_um}
+        lenses = self.adjustment.estimated_lenses() if self.adjustment else ()
+        return {name: known.sentence(name, units.get(name, FILM_UNIT)) for name, known in lenses if known.share < 1.0}
 
     def camera_file(self, name: str) -> CameraFile:
         """Camera file by the camera's name."""

@@ -117,13 +117,10 @@ def run_convert(path: Path, folder: Path, options: ConvertOptions) -> Conversion
     if target.needs == "r0_mm" and not options.r0_mm > 0.0:
         raise InputError(f"{options.family} needs a radius r0: say with --r0-mm which.")
     check_folder(folder)
-    convert = _converted_adjustment if path.suffix == ".json" else _converted_camera
-    done = convert(path, folder, options)
-    publish(
-        folder,
-        done.files,
-        readme("a lens converted", [f"From: {path.name}", "", *(f"- {line}" for line in done.sentences)], {}),
-    )
+    is_adjustment = path.suffix == ".json"
+    done = _converted_adjustment(path, options) if is_adjustment else _converted_camera(path, folder, options)
+    head = [f"From: {path.name}", "", *(f"- {line}" for line in done.sentences)]
+    publish(folder, done.files, readme("a lens converted", head, {}))
     return done
 
 
@@ -151,7 +148,7 @@ def _convert(
     return found, (sentence, f"Fitted: c, x0', y0' and {listed(found.estimated) or 'no parameter'}.")
 
 
-def _converted_adjustment(path: Path, folder: Path, options: ConvertOptions) -> Conversion:
+def _converted_adjustment(path: Path, options: ConvertOptions) -> Conversion:
     """Convert one camera's lens within the whole adjustment.json and adjustment.npz."""
     content, covariance = read_adjustment(path), read_own_covariance(path)
     name, given = calibrated_lens(path, content, options.camera)

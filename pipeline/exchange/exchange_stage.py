@@ -14,7 +14,7 @@ import numpy as np
 from adjust.functional_model.rotation import angles_from_rotation
 from measure.flags import Status
 from pipeline.errors import InputError
-from pipeline.exchange.block import Block, read_block
+from pipeline.exchange.block import read_block
 from pipeline.exchange.formats import ExportOptions, Written, format_function
 from pipeline.exchange.incoming import ForeignMark, ForeignPose, ImportOptions, Incoming
 from pipeline.files.camera_file import CameraFile, camera_text
@@ -44,7 +44,14 @@ def run_export(project: Project, format: str, folder: Path, options: ExportOptio
     write, convention = format_function("write", format)
     check_folder(folder)
     block = read_block(project)
-    _check_names(block)
+    images: dict[str, str] = {}  # by file name: other programs know images by nothing else
+    for frame in block.frames:
+        other = images.setdefault(frame.file_name, frame.image)
+        if other != frame.image:
+            raise InputError(
+                f"images {other!r} and {frame.image!r} have files of the same name {frame.file_name!r}, and other "
+                "programs know images by it. Export them as projects of their own."
+            )
     written: Written = write(block, options)
     decisions = describe_decisions(read_decision_counts(project.comparator))
     written = replace(written, notes=tuple(filter(None, [*written.notes, *block.lens_reach.values(), decisions])))
@@ -99,18 +106,6 @@ def publish(folder: Path, files: Mapping[str, str | bytes], readme_text: str) ->
             shutil.rmtree(left, ignore_errors=True)
 
 
-def _check_names(block: Block) -> None:
-    """Raise InputError for equal file names in different folders: other programs know images by the name only."""
-    images: dict[str, str] = {}
-    for frame in block.frames:
-        other = images.setdefault(frame.file_name, frame.image)
-        if other != frame.image:
-            raise InputError(
-                f"images {other!r} and {frame.image!r} have files of the same name {frame.file_name!r}, and other "
-                "programs know images by it. Export them as projects of their own."
-            )
-
-
 def run_import(format: str, paths: Sequence[Path], folder: Path, options: ImportOptions) -> Written:
     """Convert another program's files and write the result into a folder, replacing an earlier import.
 
@@ -159,24 +154,22 @@ def _comparator(marks: Sequence[ForeignMark], options: ImportOptions) -> str:
     (image, kind, point), most = times.most_common(1)[0]
     if most > 1:
         raise InputError(f"{kind} {point!r} of image {image!r} is given twice in the files. Name one of them.")
-    pitches = dict.fromkeys(sorted({mark.image for mark in marks}), pitch)
-    return "".join(comparator_lines((_mark(mark, options, pitch) for mark in marks), pitches))
-
-
-def _mark(mark: ForeignMark, options: ImportOptions, pitch_um: tuple[float, float]) -> ComparatorPoint:
-    covariance = mark.covariance_px2
-    if covariance is None:
-        if options.sigma_px is None:
-            raise InputError(
-                f"mark {mark.point!r} of image {mark.image!r} has no standard deviation: say with --sigma-px what "
-                "marks have that bring none."
-            )
-        covariance = options.sigma_px**2 * np.eye(2)
-    place = comparator_from_pixel(mark.place, pitch_um)
-    mm2 = comparator_from_pixel(comparator_from_pixel(covariance, pitch_um).T, pitch_um)
-    sigma = np.sqrt(np.diag(mm2))
-    rho = float(mm2[0, 1] / sigma.prod())
-    return ComparatorPoint(mark.image, mark.point, mark.kind, place, sigma, rho, Status.MEASURED, "")
+    rows = []
+    for mark in marks:
+        covariance = mark.covariance_px2
+        if covariance is None:
+            if options.sigma_px is None:
+                raise InputError(
+                    f"mark {mark.point!r} of image {mark.image!r} has no standard deviation: say with --sigma-px what "
+                    "marks have that bring none."
+                )
+            covariance = options.sigma_px**2 * np.eye(2)
+        place = comparator_from_pixel(mark.place, pitch)
+        mm2 = comparator_from_pixel(comparator_from_pixel(covariance, pitch).T, pitch)
+        sigma = np.sqrt(np.diag(mm2))
+        rho = float(mm2[0, 1] / sigma.prod())
+        rows.append(ComparatorPoint(mark.image, mark.point, mark.kind, place, sigma, rho, Status.MEASURED, ""))
+    return "".join(comparator_lines(rows, dict.fromkeys(sorted({mark.image for mark in marks}), pitch)))
 
 
 def _images(poses: Sequence[ForeignPose]) -> str:

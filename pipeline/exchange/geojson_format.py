@@ -28,24 +28,17 @@ _SIDE_POINTS = 8  # points per side, since a side of the frame is not a straight
 def lon_lat(xy: Array, crs: str) -> Array:
     """Longitude and latitude (n, 2) in degrees from easting and northing (n, 2) in m, or from longitude and latitude.
     Raises InputError for an unknown coordinate reference system."""
-    zone = _zone(crs)
-    if crs.upper() not in _DEGREES and zone is None:
-        raise InputError(
-            f"crs {crs!r} is not known here. Known are UTM zones (EPSG:32601 to 32660, 32701 to 32760 of WGS 84, 25828 "
-            f"to 25838 of ETRS89) and degrees of longitude and latitude ({', '.join(_DEGREES)}). Transform the points "
-            "to one of them."
-        )
-    return _from_utm(xy, *zone) if zone else xy
-
-
-def _zone(crs: str) -> tuple[int, bool] | None:
-    """Number of a UTM zone, and whether it is southern; None for other systems."""
-    found = re.fullmatch(r"EPSG:(326|327|258)(\d\d)", crs.upper())
-    if found is None:
-        return None
-    number = int(found[2])
-    usable = 28 <= number <= 38 if found[1] == "258" else 1 <= number <= 60
-    return (number, found[1] == "327") if usable else None
+    if crs.upper() in _DEGREES:
+        return xy
+    if utm := re.fullmatch(r"EPSG:(326|327|258)(\d\d)", crs.upper()):
+        zone, is_european = int(utm[2]), utm[1] == "258"
+        if 28 <= zone <= 38 if is_european else 1 <= zone <= 60:
+            return _from_utm(xy, zone, southern=utm[1] == "327")
+    raise InputError(
+        f"crs {crs!r} is not known here. Known are UTM zones (EPSG:32601 to 32660, 32701 to 32760 of WGS 84, 25828 "
+        f"to 25838 of ETRS89) and degrees of longitude and latitude ({', '.join(_DEGREES)}). Transform the points "
+        "to one of them."
+    )
 
 
 def _from_utm(xy: Array, zone: int, southern: bool) -> Array:
@@ -95,7 +88,18 @@ def write_geojson(block: Block, options: ExportOptions) -> Written:
         if isinstance(outline, str):
             left_out.append(f"{frame.image}: {outline}")
             continue
-        features.append(_feature(frame, lon_lat(outline[:, :2] * block.project.unit_mm / 1000.0, crs), outline[0, 2]))
+        ring = lon_lat(outline[:, :2] * block.project.unit_mm / 1000.0, crs)
+        x, y = (ring - ring.mean(axis=0)).T
+        if (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() <= 0.0:  # clockwise: the plane is seen from its other side
+            ring = ring[::-1]
+        corners = [[round(lon, 9), round(lat, 9)] for lon, lat in [*ring.tolist(), ring[0].tolist()]]
+        features.append(
+            {
+                "type": "Feature",
+                "properties": {"image": frame.image, "camera": frame.camera, "ground": float(outline[0, 2])},
+                "geometry": {"type": "Polygon", "coordinates": [corners]},
+            }
+        )
     content = {"type": "FeatureCollection", "features": features}
     notes = ("The terrain is taken as level, at the mean height of the points that an image shows.",)
     lost = ("relief", "all standard deviations")
@@ -103,13 +107,17 @@ def write_geojson(block: Block, options: ExportOptions) -> Written:
 
 
 def footprint(block: Block, frame: WholeFrame) -> Array | str:
-    """Outline (n, 3) in object coordinates of a frame on level ground, or the reason why there is none."""
+    """Outline (n, 3) in object coordinates of a frame on level ground, counter-clockwise from the lower left corner, or
+    the reason why there is none."""
     model = frame.model
     assert model is not None
     heights = [block.points[mark.point][2] for mark in frame.observed(False) if mark.point in block.points]
     if not heights:
         return "none of its points is adjusted, so the height of the terrain is not known."
-    outline_mm = _outline(frame_corners_mm(block, frame))
+    (left, bottom), (right, top) = frame_corners_mm(block, frame)
+    turns = np.array([(left, bottom), (right, bottom), (right, top), (left, top), (left, bottom)])
+    share = np.arange(_SIDE_POINTS)[:, None] / _SIDE_POINTS
+    outline_mm = np.concatenate([start + share * (end - start) for start, end in pairwise(turns)])
     ideal, found = model.lens.ideal_from_observed(outline_mm)
     c, point = model.lens.interior[0], model.lens.interior[1:]
     # x' = x0' - c U/W: towards the ground W is negative, and the ray is (x' - x0', y' - y0', -c).
@@ -118,26 +126,3 @@ def footprint(block: Block, frame: WholeFrame) -> Array | str:
     if not (found.all() and (reach > 0.0).all()):
         return "its frame reaches beyond the horizon, or the lens folds in it."
     return np.asarray(model.station + reach[:, None] * rays)
-
-
-def _outline(corners_mm: Array) -> Array:
-    """Points along a rectangle between two opposite corners, counter-clockwise from the lower left one."""
-    (left, bottom), (right, top) = corners_mm
-    turns = np.array([(left, bottom), (right, bottom), (right, top), (left, top), (left, bottom)])
-    share = np.arange(_SIDE_POINTS)[:, None] / _SIDE_POINTS
-    return np.concatenate([start + share * (end - start) for start, end in pairwise(turns)])
-
-
-def _feature(frame: WholeFrame, outline: Array, height: float) -> dict[str, object]:
-    ring = outline if _area(outline) > 0.0 else outline[::-1]  # clockwise if the plane is seen from its other side
-    closed = [*ring.tolist(), ring[0].tolist()]
-    return {
-        "type": "Feature",
-        "properties": {"image": frame.image, "camera": frame.camera, "ground": float(height)},
-        "geometry": {"type": "Polygon", "coordinates": [[[round(lon, 9), round(lat, 9)] for lon, lat in closed]]},
-    }
-
-
-def _area(ring: Array) -> float:
-    x, y = (ring - ring.mean(axis=0)).T
-    return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2.0

@@ -89,7 +89,8 @@ def _camera_files(block: Block, camera: str, options: ExportOptions) -> Written:
         frames = [frame for frame in frames if frame.image not in few]
         for frame in frames:
             marks = found[frame.image]
-            places = dict(zip(_names(marks), frame.pixels(marks) + MICMAC.first_pixel_px, strict=True))
+            pixels = frame.pixels(marks) + MICMAC.first_pixel_px
+            places = {mark.point: pixel for mark, pixel in zip(marks, pixels, strict=True)}
             own = _marks(frame.file_name, places, _sigmas_px(marks, sum(frame.known_pitch_um) / 2000.0))
             files[f"Ori-InterneScan/MeasuresIm-{frame.file_name}.xml"] = xml_text(*own)
     turned = [frame for frame in frames if frame.turn != NOT_TURNED]
@@ -146,10 +147,6 @@ def camera_box(block: Block, frame: OutFrame, options: ExportOptions) -> Canvas:
         )
     with block.open_scan(frame) as scan:
         return Canvas(0.0, 0.0, x_um / 1000.0, scan.width_px, scan.height_px)
-
-
-def _names(marks: Sequence[ComparatorPoint]) -> list[str]:
-    return [mark.point for mark in marks]
 
 
 def _marks(
@@ -209,7 +206,8 @@ def _measures(block: Block, frames: Sequence[OutFrame], box: Canvas, reech: str)
     for frame in frames:
         marks = frame.observed(fiducials=False)
         pixels = box.pixel_from_camera(frame.camera_mm(marks)) + MICMAC.first_pixel_px
-        places = {point: pixel for point, pixel in zip(_names(marks), pixels, strict=True) if point in block.points}
+        known = zip(marks, pixels, strict=True)
+        places = {mark.point: pixel for mark, pixel in known if mark.point in block.points}
         images.append(_marks(f"{reech}{frame.file_name}", places, _sigmas_px(marks, box.pitch_mm)))
     return xml_text("SetOfMesureAppuisFlottants", images)
 
@@ -298,41 +296,34 @@ def write_mmvii(block: Block, options: ExportOptions) -> Written:
 
 
 def _mmvii_measures(frame: OutFrame, marks: tuple[ComparatorPoint, ...]) -> str:
-    places = frame.pixels(marks) + MMVII.first_pixel_px
-    measures: list[tuple[str, Content]] = [
-        ("el", {"Name": f'"{mark.point}"', "Pt": place, "Sigma2": np.array(_sigma2(mark, frame.known_pitch_um))})
-        for mark, place in zip(marks, places, strict=True)
-    ]
+    measures: list[tuple[str, Content]] = []
+    for mark, place in zip(marks, frame.pixels(marks) + MMVII.first_pixel_px, strict=True):
+        sigma2 = np.array([1.0, 0.0, 1.0])  # xx, xy, yy in px
+        if mark.sigma_mm is not None:
+            sx, sy = mark.sigma_mm / (np.array(frame.known_pitch_um) / 1000.0)
+            sigma2 = np.array([sx * sx, -mark.rho * sx * sy, sy * sy])  # rows point down, so xy changes its sign
+        measures.append(("el", {"Name": f'"{mark.point}"', "Pt": place, "Sigma2": sigma2}))
     data: Content = {"SetMesIm": {"NameIm": f'"{frame.file_name}"', "Measures": measures}}
     return xml_text("Root", {"Type": '"MMVII_Serialization"', "Version": '"0.0.0"', "Data": data})
 
 
-def _sigma2(mark: ComparatorPoint, pitch_um: tuple[float, float]) -> tuple[float, float, float]:
-    """Covariance xx, xy, yy in px. The rows point down, so xy changes its sign."""
-    if mark.sigma_mm is None:
-        return 1.0, 0.0, 1.0
-    sx, sy = (float(sigma) for sigma in mark.sigma_mm / (np.array(pitch_um) / 1000.0))
-    return sx * sx, -mark.rho * sx * sy, sy * sy
-
-
 def import_mmvii(paths: Sequence[Path], options: ImportOptions) -> Incoming:
     """Read MesIm-*.xml: marks with their covariances. Those in a folder Fiducials are fiducials."""
-    return Incoming(tuple(mark for path in paths for mark in _mmvii_marks(path, options)))
-
-
-def _mmvii_marks(path: Path, options: ImportOptions) -> Iterator[ForeignMark]:
-    is_fiducial = options.fiducials or path.resolve().parent.name == _FOLDERS[True]
-    measures = read_xml(path).find("Data/SetMesIm")
-    if measures is None:
-        raise InputError(f"{path}: has no <SetMesIm>. Files MesIm-*.xml are read.")
-    image = image_name(_unquoted(child_text(measures, "NameIm", path)))
-    for element in measures.iterfind("Measures/el"):
-        place = np.array(child_numbers(element, "Pt", 2, path)) - MMVII.first_pixel_px
-        xx, xy, yy = child_numbers(element, "Sigma2", 3, path)
-        known = xx > 0.0 and yy > 0.0 and xx * yy > xy * xy
-        covariance = np.array([[xx, xy], [xy, yy]]) if known else None
-        name = _unquoted(child_text(element, "Name", path))
-        yield ForeignMark(image, name, "fiducial" if is_fiducial else "target", place, covariance)
+    marks = []
+    for path in paths:
+        is_fiducial = options.fiducials or path.resolve().parent.name == _FOLDERS[True]
+        measures = read_xml(path).find("Data/SetMesIm")
+        if measures is None:
+            raise InputError(f"{path}: has no <SetMesIm>. Files MesIm-*.xml are read.")
+        image = image_name(_unquoted(child_text(measures, "NameIm", path)))
+        for element in measures.iterfind("Measures/el"):
+            place = np.array(child_numbers(element, "Pt", 2, path)) - MMVII.first_pixel_px
+            xx, xy, yy = child_numbers(element, "Sigma2", 3, path)
+            known = xx > 0.0 and yy > 0.0 and xx * yy > xy * xy
+            covariance = np.array([[xx, xy], [xy, yy]]) if known else None
+            name = _unquoted(child_text(element, "Name", path))
+            marks.append(ForeignMark(image, name, "fiducial" if is_fiducial else "target", place, covariance))
+    return Incoming(tuple(marks))
 
 
 def _unquoted(text: str) -> str:

@@ -26,13 +26,11 @@ from pipeline.exchange.block import Block, OutFrame, WholeFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import (
     Y_DOWN_Z_FORWARD,
-    ForeignPose,
     ImportOptions,
     Incoming,
     foreign_pose,
     opencv_camera,
 )
-from pipeline.files.camera_file import CameraFile
 from pipeline.files.opencv_file import FISHEYE_MODEL, read_pixel_camera
 from pipeline.opencv_check.opencv_calibration import FISHEYE, INTERIOR, NAMES, fixed, model_names, opencv_values
 from pipeline.resampling.canvas import Canvas, outline_canvas
@@ -52,13 +50,11 @@ PRISMS = (*BROWN, "s1", "s2", "s3", "s4")
 _AFFINE = ("b1", "b2")
 _ONE_SCALE = ("none", "torlegard")  # families without affinity and shear
 
-
 OPENCV = Convention(
     (0.0, 0.0),
     "column right, row down; camera x right, y down, z forward; camera = R X + t",
     "OpenCV, calib3d: projectPoints, and undistort, whose maps count from the first pixel's centre",
 )
-
 
 COLMAP = Convention(
     (0.5, 0.5),
@@ -66,16 +62,9 @@ COLMAP = Convention(
     "colmap.github.io/format.html and cameras.html: the upper left corner of the image is (0, 0)",
 )
 
-
 _OPENCV = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-
-
 _FULL = ("k3", "k4", "k5", "k6")
-
-
 _FISHEYE = "OPENCV_FISHEYE"
-
-
 _MODELS: dict[str, tuple[int, tuple[str, ...]]] = {  # focal lengths, and the distortion's parameters
     "SIMPLE_PINHOLE": (1, ()),
     "PINHOLE": (2, ()),
@@ -114,11 +103,15 @@ def nearest_lens(block: Block, frame: OutFrame, models: Sequence[Sequence[str]],
     """Fit the lens of an image's camera in one of several models, each given by names of OpenCV's parameters.
 
     The first model that is identical is taken; else the first that is close enough; else the closest. If the lens
-    distortion is removed from the frames, the result is a lens without distortion.
+    distortion is removed from the frames, the result is a lens without distortion. OpenCV's fisheye stays as it is; its
+    shear, which programs leave out, becomes the misfit.
     """
     lens = frame.lens
     if options.with_lens or lens.distortion.family == "none":
         return FittedLens(_undistorted(lens), 0.0)
+    if lens.distortion.family == FISHEYE:
+        farthest_mm = float(np.abs(frame_corners_mm(block, frame)[:, 1] - lens.interior[2]).max())
+        return FittedLens(lens, abs(float(lens.parameters[-1])) * farthest_mm)
     for names in models:
         if _has_only(lens, (*names, "b1")):
             return FittedLens(lens, 0.0)
@@ -128,16 +121,6 @@ def nearest_lens(block: Block, frame: OutFrame, models: Sequence[Sequence[str]],
         if fits[-1].largest_mm <= limit_mm:
             return fits[-1]
     return min(fits, key=lambda each: each.largest_mm)
-
-
-def fisheye_lens(block: Block, frame: OutFrame, options: ExportOptions) -> FittedLens | None:
-    """The lens of an image's camera if it is OpenCV's fisheye. Its shear, which programs leave out, becomes the
-    misfit."""
-    lens = frame.lens
-    if lens.distortion.family != FISHEYE or options.with_lens:
-        return None
-    farthest_mm = float(np.abs(frame_corners_mm(block, frame)[:, 1] - lens.interior[2]).max())
-    return FittedLens(lens, abs(float(lens.parameters[-1])) * farthest_mm)
 
 
 def sheared_lens(block: Block, frame: OutFrame, at_ideal: bool) -> FittedLens:
@@ -159,7 +142,13 @@ def sheared_lens(block: Block, frame: OutFrame, at_ideal: bool) -> FittedLens:
     rays, found = lens.ray_from_observed(grid_mm)
     rays, observed_mm = rays[found], grid_mm[found]
     fitted = _sheared_fit(rays, observed_mm)
-    return FittedLens(fitted, float(np.linalg.norm(_sheared(fitted, rays) - observed_mm, axis=1).max()))
+    # Affinity and shear of the ideal point: OpenCV's model without them, and then their terms in the ray.
+    parameters, (b1, b2) = fitted.parameters.copy(), fitted.parameters[-2:]
+    parameters[-2:] = 0.0
+    bent, _ = replace(fitted, interior=np.array([1.0, 0.0, 0.0]), parameters=parameters).camera_from_ray(rays)
+    bent[:, 0] += b1 * rays[:, 0] - b2 * rays[:, 1]
+    left_mm = fitted.interior[0] * bent + fitted.interior[1:] - observed_mm
+    return FittedLens(fitted, float(np.linalg.norm(left_mm, axis=1).max()))
 
 
 def frame_corners_mm(block: Block, frame: OutFrame) -> Array:
@@ -220,15 +209,6 @@ def _sheared_fit(rays: Array, observed_mm: Array) -> Lens:
     fitted = dict(zip((*BROWN, *_AFFINE), terms, strict=True))
     parameters = np.array([fitted.get(name, 0.0) / c for name in parameter_names("opencv")])
     return Lens(Distortion("opencv"), np.array([c, x0, y0]), parameters)
-
-
-def _sheared(lens: Lens, rays: Array) -> Array:
-    """Camera coordinates (n, 2) in mm of rays (n, 2)."""
-    parameters, (b1, b2) = lens.parameters.copy(), lens.parameters[-2:]
-    parameters[-2:] = 0.0
-    bent, _ = replace(lens, interior=np.array([1.0, 0.0, 0.0]), parameters=parameters).camera_from_ray(rays)
-    bent[:, 0] += b1 * rays[:, 0] - b2 * rays[:, 1]
-    return np.asarray(lens.interior[0] * bent + lens.interior[1:])
 
 
 @dataclass(frozen=True)
@@ -305,7 +285,7 @@ def pinhole_frames(
     frames, left_out = [], list(block.unoriented_note())
     for frame in block.whole(block.oriented()):
         if frame.camera not in lenses:
-            lenses[frame.camera] = fisheye_lens(block, frame, options) or nearest_lens(block, frame, models, options)
+            lenses[frame.camera] = nearest_lens(block, frame, models, options)
         try:
             frames.append(_pinhole(block, frame, lenses[frame.camera], options))
         except MeasurementError as error:
@@ -447,22 +427,18 @@ def _yaml(frame: PinholeFrame, lens_reach: str | None) -> str:
 def import_opencv(paths: Sequence[Path], options: ImportOptions) -> Incoming:
     """Read files of cv2.FileStorage: matrix, distortion and size as camera files; R and t, if given, as
     orientations."""
-    found = [_camera_and_pose(path, options) for path in paths]
-    poses = tuple(pose for _, pose in found if pose is not None)
-    return Incoming(cameras=tuple(camera for camera, _ in found), poses=poses)
-
-
-def _camera_and_pose(path: Path, options: ImportOptions) -> tuple[CameraFile, ForeignPose | None]:
-    found, storage = read_pixel_camera(path)
-    name = storage.getNode("camera").string() or path.stem
-    picture = image_name(storage.getNode("image").string() or path.stem)
-    camera = opencv_camera(
-        path, name, found.interior_px, found.distortion, found.size_px, options, OPENCV, found.family
-    )
-    turn, shift = storage.getNode("R").mat(), storage.getNode("t").mat()
-    if turn is None or shift is None:
-        return camera, None
-    return camera, foreign_pose(picture, np.array(turn, dtype=float), np.ravel(shift).astype(float))
+    cameras, poses = [], []
+    for path in paths:
+        found, storage = read_pixel_camera(path)
+        name = storage.getNode("camera").string() or path.stem
+        picture = image_name(storage.getNode("image").string() or path.stem)
+        cameras.append(
+            opencv_camera(path, name, found.interior_px, found.distortion, found.size_px, options, OPENCV, found.family)
+        )
+        turn, shift = storage.getNode("R").mat(), storage.getNode("t").mat()
+        if turn is not None and shift is not None:
+            poses.append(foreign_pose(picture, np.array(turn, dtype=float), np.ravel(shift).astype(float)))
+    return Incoming(cameras=tuple(cameras), poses=tuple(poses))
 
 
 def write_colmap(block: Block, options: ExportOptions) -> Written:
@@ -485,11 +461,22 @@ def import_pycolmap(user: str) -> Any:
 
 
 def _reconstruction(pycolmap: Any, block: Block, frames: list[PinholeFrame]) -> Any:
-    """Reconstruction of the frames with the marks of adjusted points, and of these points with their tracks."""
+    """Reconstruction of the frames with the marks of adjusted points, and of these points with their tracks.
+
+    Cameras are of the model OPENCV, FULL_OPENCV if the lens has a third radial term, or OPENCV_FISHEYE.
+    """
     made, tracks = pycolmap.Reconstruction(), defaultdict(list)
     for number, frame in enumerate(frames, 1):
-        camera = _colmap_camera(pycolmap, frame, number)
-        made.add_camera_with_trivial_rig(camera)
+        model, terms, rest = "OPENCV", frame.lens.named(_OPENCV[len(INTERIOR) :]), frame.lens.named(_FULL)
+        if rest.any():
+            model, terms = "FULL_OPENCV", np.concatenate([terms, rest])
+        if frame.lens.fisheye:
+            model, terms = _FISHEYE, np.array(frame.lens.fisheye)
+        params = [*frame.interior_px(COLMAP), *terms]
+        width, height = frame.canvas.width_px, frame.canvas.height_px
+        made.add_camera_with_trivial_rig(
+            pycolmap.Camera(camera_id=number, model=model, width=width, height=height, params=params)
+        )
         marks = tuple(mark for mark in frame.frame.observed(fiducials=False) if mark.point in block.points)
         places = frame.pixels(marks) + COLMAP.first_pixel_px
         image = pycolmap.Image(frame.picture, places, number, number)
@@ -503,19 +490,6 @@ def _reconstruction(pycolmap: Any, block: Block, frames: list[PinholeFrame]) -> 
             track.add_element(number, index)
         made.add_point3D(block.points[point], track)
     return made
-
-
-def _colmap_camera(pycolmap: Any, frame: PinholeFrame, number: int) -> Any:
-    """Camera of the model OPENCV, FULL_OPENCV if the lens has a third radial term, or OPENCV_FISHEYE."""
-    interior = frame.interior_px(COLMAP)
-    rest = frame.lens.named(_FULL)
-    model = "FULL_OPENCV" if rest.any() else "OPENCV"
-    params = [*interior, *frame.lens.named(_OPENCV[len(INTERIOR) :]), *(rest if model == "FULL_OPENCV" else ())]
-    if frame.lens.fisheye:
-        model, params = _FISHEYE, [*interior, *frame.lens.fisheye]
-    return pycolmap.Camera(
-        camera_id=number, model=model, width=frame.canvas.width_px, height=frame.canvas.height_px, params=params
-    )
 
 
 def import_colmap(paths: Sequence[Path], options: ImportOptions) -> Incoming:

@@ -7,7 +7,7 @@ are described by a variance component between archives, estimated for each quant
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,7 +30,6 @@ from pipeline.text.wording import counted, listed
 from pipeline.types import Array
 
 _ONE_CAMERA = ("interior", "fiducial")  # kinds of parameters that belong to a camera
-Changed = Callable[[Parameter, Quantity], Quantity]
 _HEAD = "# Adjusted camera, saved by reseau"
 
 
@@ -194,7 +193,15 @@ def _replace_quantities(one: _Calibration, values: Mapping[Parameter, float], co
     interior = {key: changed(Parameter.interior(name, key), each) for key, each in camera.interior.items()}
     point = replace(camera.principal_point_mm, x=interior["x0"], y=interior["y0"])
     lens = {key: interior[key] for key in camera.distortion.parameters}
-    fiducials = {id: _fiducial(one, id, mark, changed, covariance) for id, mark in camera.fiducials.items()}
+    fiducials: dict[str, FiducialRecord] = {}
+    for id, mark in camera.fiducials.items():
+        x, y = (Parameter.fiducial(name, id, axis) for axis in "xy")
+        rho = mark.rho
+        if x in one.parameters and y in one.parameters:
+            i, j = one.parameters.index(x), one.parameters.index(y)
+            scale = math.sqrt(covariance[i, i] * covariance[j, j])
+            rho = float(covariance[i, j] / scale) if scale else 0.0
+        fiducials[id] = replace(mark, x_mm=changed(x, mark.x_mm), y_mm=changed(y, mark.y_mm), rho=rho)
     camera = replace(
         camera,
         principal_distance_mm=interior["c"],
@@ -205,16 +212,6 @@ def _replace_quantities(one: _Calibration, values: Mapping[Parameter, float], co
     return replace(
         record, cameras={name: camera}, images={}, frames={}, points={}, residuals=(), suspects=(), correlations=()
     )
-
-
-def _fiducial(one: _Calibration, id: str, mark: FiducialRecord, changed: Changed, covariance: Array) -> FiducialRecord:
-    x, y = (Parameter.fiducial(one.camera.name, id, axis) for axis in "xy")
-    rho = mark.rho
-    if x in one.parameters and y in one.parameters:
-        at = [one.parameters.index(each) for each in (x, y)]
-        scale = math.sqrt(covariance[at[0], at[0]] * covariance[at[1], at[1]])
-        rho = float(covariance[at[0], at[1]] / scale) if scale else 0.0
-    return replace(mark, x_mm=changed(x, mark.x_mm), y_mm=changed(y, mark.y_mm), rho=rho)
 
 
 def _adjusted_camera(one: _Calibration, record: CameraRecord, earlier: Path, path: Path, source: Source) -> CameraFile:

@@ -27,12 +27,28 @@ Table = dict[str, list[Cell]]
 
 def write_csv(block: Block, options: ExportOptions) -> Written:
     """Write one CSV file per table; numbers with all their digits."""
-    return Written({f"{name}.csv": _csv_text(table) for name, table in tables(block).items()})
+    head = f"# {CSV.axes}; the CENTRE of the top-left pixel is (0, 0)"
+    files = {}
+    for name, table in tables(block).items():
+        rows = (csv_line([_cell(value) for value in row]) for row in zip(*table.values(), strict=True))
+        files[f"{name}.csv"] = "\n".join([head, csv_line(list(table)), *rows]) + "\n"
+    return Written(files)
 
 
 def write_parquet(block: Block, options: ExportOptions) -> Written:
     """Write one Parquet file per table. Raises InputError where pyarrow is not installed."""
-    return Written({f"{name}.parquet": _parquet_bytes(table) for name, table in tables(block).items()})
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise missing_extra("the format parquet", "pyarrow", "parquet") from None
+    files = {}
+    for name, table in tables(block).items():
+        written = io.BytesIO()
+        described = pyarrow.table(table).replace_schema_metadata({"conventions": CSV.axes})
+        pyarrow.parquet.write_table(described, written)
+        files[f"{name}.parquet"] = written.getvalue()
+    return Written(files)
 
 
 def tables(block: Block) -> Mapping[str, Table]:
@@ -41,7 +57,11 @@ def tables(block: Block) -> Mapping[str, Table]:
     rows: dict[str, Iterable[Row]] = {"marks": (_mark(frame, mark) for frame in block.frames for mark in frame.marks)}
     if adjustment := block.adjustment:
         rows |= {
-            "images": (_image(adjustment, frame) for frame in block.oriented()),
+            "images": (
+                {"image": frame.image, "camera": frame.camera, **_values_and_sigmas(known.exterior.elements)}
+                for frame in block.oriented()
+                for known in [adjustment.images[frame.image]]
+            ),
             "transformations": _transformations(adjustment, block),
             "covariances": _covariances(block),
             "points": (
@@ -50,7 +70,11 @@ def tables(block: Block) -> Mapping[str, Table]:
             ),
             "cameras": _cameras(adjustment),
         }
-    return {name: _table(list(each)) for name, each in rows.items()}
+    columns: dict[str, Table] = {}
+    for name, each in rows.items():
+        cells = list(each)
+        columns[name] = {column: [row[column] for row in cells] for column in (cells[0] if cells else ())}
+    return columns
 
 
 def _mark(frame: OutFrame, mark: ComparatorPoint) -> Row:
@@ -75,11 +99,6 @@ def _mark(frame: OutFrame, mark: ComparatorPoint) -> Row:
         "camera_y_mm": camera[1],
         "reason": mark.reason,
     }
-
-
-def _image(adjustment: AdjustmentRecord, frame: OutFrame) -> Row:
-    elements = adjustment.images[frame.image].exterior.elements
-    return {"image": frame.image, "camera": frame.camera, **_values_and_sigmas(elements)}
 
 
 def _transformations(adjustment: AdjustmentRecord, block: Block) -> Iterable[Row]:
@@ -128,32 +147,10 @@ def _finite(value: float) -> Cell:
     return value if math.isfinite(value) else None
 
 
-def _table(rows: list[Row]) -> Table:
-    return {column: [row[column] for row in rows] for column in (rows[0] if rows else ())}
-
-
-def _csv_text(table: Table) -> str:
-    head = f"# {CSV.axes}; the CENTRE of the top-left pixel is (0, 0)"
-    rows = zip(*table.values(), strict=True)
-    return "\n".join([head, csv_line(list(table)), *(csv_line([_cell(value) for value in row]) for row in rows)]) + "\n"
-
-
 def _cell(value: Cell) -> str:
     if value is None:
         return ""
     return str(value).lower() if isinstance(value, bool) else repr(value) if isinstance(value, float) else str(value)
-
-
-def _parquet_bytes(table: Table) -> bytes:
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise missing_extra("the format parquet", "pyarrow", "parquet") from None
-    made = pyarrow.table(table).replace_schema_metadata({"conventions": CSV.axes})
-    written = io.BytesIO()
-    pyarrow.parquet.write_table(made, written)
-    return written.getvalue()
 
 
 BINGO = Convention(

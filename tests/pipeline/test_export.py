@@ -154,13 +154,14 @@ def test_mmvii_has_the_whole_covariance(project: Path, tmp_path: Path) -> None:
 
 
 def test_covariances_and_bent_sights_follow_the_axes(project: Path) -> None:
-    mark = replace(read_block(read_project(project)).frames[0].marks[0], rho=0.3, sigma_mm=np.array([0.002, 0.004]))
-    xx, xy, yy = micmac_format._sigma2(mark, (20.0, 20.0))
+    block = read_block(read_project(project))
+    frame = block.frames[0]
+    mark = replace(frame.marks[0], rho=0.3, sigma_mm=np.array([0.002, 0.004]))
+    text = micmac_format._mmvii_measures(replace(frame, pitch_um=(20.0, 20.0)), (mark,))
+    xx, xy, yy = map(float, present(re.search(r"<Sigma2>(.*)</Sigma2>", text))[1].split())
     assert (xx, yy) == pytest.approx((0.01, 0.04))
     assert xy == pytest.approx(-0.3 * 0.1 * 0.2)
     # The earth's curvature lowers a point at 700 m by 4 cm: some 3 um in the picture.
-    block = read_block(read_project(project))
-    frame = block.frames[0]
     assert pinhole.sight_misfit_mm(block, frame) == 0.0
     bent = replace(frame, model=replace(present(frame.model), line_of_sight=LineOfSight(curvature=True)))
     reach = np.hypot(*(POINTS - TRUTH.stations[0]).T[:2])
