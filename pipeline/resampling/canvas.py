@@ -74,12 +74,8 @@ def image_chain(
 
 
 def measured_chain(measured: MeasuredScan, taking_lens: Lens | None = None) -> FrameChain | None:
-    """Chain from the fiducials of a scan alone; None where too few were found.
-
-    Parameters
-    ----------
-    taking_lens : of the camera that photographed the film.
-    """
+    """Chain from the fiducials of a scan alone; None where too few were found. taking_lens: of the camera that
+    photographed the film."""
     matrix = measured.frame.pixel_from_camera
     if matrix is None:
         return None

@@ -46,8 +46,6 @@ from pipeline.workers import worker_pool
 
 _BAND_PX = 256  # rows decoded at a time into the scratch file
 Degree = Literal[3, 5]
-
-
 MARGIN_PX = 16  # around a tile: there the prefilter of a spline of degree 5, with pole 0.43, has decayed to 1e-6
 _TRUNCATED = 3.0  # standard deviations of the smoothing
 _COARSER = 1.25  # px of the scan, step from which on it is smoothed
@@ -349,15 +347,12 @@ def resample_tasks(
     if with_lens and adjustment is None:
         raise InputError("--lens needs an adjusted lens. Run `reseau adjust` first, or resample without it.")
     images = {} if adjustment is None else adjustment.images
-    oriented = {
-        image for image, record in images.items() if record.exterior.is_oriented
-    }  # by what fiducials do not tell
     tasks: dict[str, ResampleTask] = {}
     failed = []
+    taking_lens = None if project.lens is None else project.lens.lens
     for measured in scans:
         image = measured.frame.image
         frame = project.image_frame(image)
-        taking_lens = None if project.lens is None else project.lens.lens
         chain = _chain(measured, adjustment, with_lens, frame != image, taking_lens)
         if isinstance(chain, str):
             failed.append(Resampled(image, None, problem=chain))
@@ -367,6 +362,9 @@ def resample_tasks(
             tasks[frame] = replace(tasks[frame], scans=(*tasks[frame].scans, scan))
             continue
         pitch_mm = (pitch_um or float(np.sqrt(np.prod(measured.pitch_um)))) / 1000.0
+        # Single doubtful marks do not count, nor does anything where the image is oriented, by more than fiducials.
+        is_doubtful = has_problem(measured) or scan_verdict(measured) is Verdict.POOR
+        is_oriented = image in images and images[image].exterior.is_oriented
         tasks[frame] = ResampleTask(
             image=frame,
             camera=project.image_camera(image).name,
@@ -376,15 +374,9 @@ def resample_tasks(
             max_pixels=project.max_pixels,
             target=path_below(folder, frame, ".tif"),
             scans=(scan,),
-            doubt="" if image in oriented else _frame_doubt(measured),
+            doubt=scan_doubt(measured) if is_doubtful and not is_oriented else "",
         )
     return list(tasks.values()), failed
-
-
-def _frame_doubt(measured: MeasuredScan) -> str:
-    """Why the frame of a scan needs a look, single marks left out; "" if it needs none."""
-    is_doubtful = has_problem(measured) or scan_verdict(measured) is Verdict.POOR
-    return scan_doubt(measured) if is_doubtful else ""
 
 
 def _chain(
@@ -392,7 +384,7 @@ def _chain(
     adjustment: AdjustmentRecord | None,
     with_lens: bool,
     is_part: bool,
-    taking_lens: Lens | None = None,
+    taking_lens: Lens | None,
 ) -> frame_canvas.FrameChain | str:
     """Adjusted chain of an image, or the chain from its fiducials, or the reason why there is none."""
     image = measured.frame.image
@@ -436,7 +428,9 @@ def _resampled(task: ResampleTask) -> Resampled:
         task.target.parent.mkdir(parents=True, exist_ok=True)
         parts = []
         for scan, chain in scans:
-            rows = _rows_at_a_time(chain, task.pitch_mm, canvas.width_px)
+            row_of_tiles = np.array([(0, 0), (canvas.width_px, 0), (0, -TILE_PX), (canvas.width_px, -TILE_PX)])
+            pixels, _ = chain.scan_from_frame(row_of_tiles * task.pitch_mm)
+            rows = int(np.ptp(pixels[:, 1])) + 2 * MARGIN_PX
             source = opened.enter_context(open_source(scan, rows, task.target.parent))
             parts.append(Part(source, chain, _smoothing_px(chain, canvas)))
         parts = find_inner_edges(parts)
@@ -462,13 +456,6 @@ def _smoothing_px(chain: frame_canvas.FrameChain, canvas: frame_canvas.Canvas) -
     return (step_px - 1.0) / 2.0 if step_px > _COARSER else 0.0
 
 
-def _rows_at_a_time(chain: frame_canvas.FrameChain, pitch_mm: float, width_px: int) -> int:
-    """Number of rows of a scan that a row of tiles covers."""
-    ends = np.array([(0.0, 0.0), (width_px, 0.0), (0.0, -TILE_PX), (width_px, -TILE_PX)]) * pitch_mm
-    pixels, _ = chain.scan_from_frame(ends)
-    return int(np.ptp(pixels[:, 1])) + 2 * MARGIN_PX
-
-
 def resampled_json(results: Sequence[Resampled]) -> list[dict[str, object]]:
     """The results for `--json`."""
     return [asdict(result) | {"path": result.path and str(result.path)} for result in results]
@@ -476,13 +463,8 @@ def resampled_json(results: Sequence[Resampled]) -> list[dict[str, object]]:
 
 @contextmanager
 def open_source(scan: Scan, rows_at_a_time: int, scratch: Path) -> Iterator[SampleSource]:
-    """Open a scan as a source. Where a row of tiles needs more rows than stay decoded, the scan is decoded to a file
-    first.
-
-    Parameters
-    ----------
-    rows_at_a_time : rows of the scan that a row of tiles needs.
-    """
+    """Open a scan as a source. Where a row of tiles needs more rows at a time than stay decoded, the scan is decoded to
+    a file first."""
     wide = scan.segment_px[1] >= scan.width_px
     if not wide or rows_at_a_time <= scan.rows_kept:
         yield SampleSource(scan)
@@ -542,25 +524,26 @@ def spline_samples(
 
 
 def find_inner_edges(parts: Sequence[Part]) -> list[Part]:
-    """Determine the inner edges of the scans. Raises MeasurementError for scans with different pixel types."""
+    """Determine the inner edges of the scans: those whose centre lies in another scan.
+
+    Raises MeasurementError for scans with different pixel types.
+    """
     kinds = {(part.source.channels, np.dtype(part.source.dtype).name) for part in parts}
     if len(kinds) > 1:
         kinds_text = " and ".join(f"{n} channel{'s' * (n > 1)} of {dtype}" for n, dtype in sorted(kinds))
         raise MeasurementError(f"its scans have different pixel types: {kinds_text}. Scan both alike.")
-    return [replace(part, inner=_inner_edges(part, [each for each in parts if each is not part])) for part in parts]
-
-
-def _inner_edges(part: Part, others: Sequence[Part]) -> tuple[bool, ...]:
-    """The edges whose centre lies in another scan."""
-    right, bottom = part.source.width_px - 1.0, part.source.height_px - 1.0
-    middles = np.array([[0.0, bottom / 2], [right, bottom / 2], [right / 2, 0.0], [right / 2, bottom]])
-    places_mm, _ = part.chain.frame_from_scan(middles)
-    inside = np.zeros(4, dtype=bool)
-    for other in others:
-        pixels, found = other.chain.scan_from_frame(places_mm)
-        col, row = pixels.T
-        inside |= found & (col >= 0) & (col < other.source.width_px) & (row >= 0) & (row < other.source.height_px)
-    return tuple(inside.tolist())
+    found_parts = []
+    for part in parts:
+        right, bottom = part.source.width_px - 1.0, part.source.height_px - 1.0
+        middles = np.array([[0.0, bottom / 2], [right, bottom / 2], [right / 2, 0.0], [right / 2, bottom]])
+        places_mm, _ = part.chain.frame_from_scan(middles)
+        inside = np.zeros(4, dtype=bool)
+        for other in (each for each in parts if each is not part):
+            pixels, found = other.chain.scan_from_frame(places_mm)
+            col, row = pixels.T
+            inside |= found & (col >= 0) & (col < other.source.width_px) & (row >= 0) & (row < other.source.height_px)
+        found_parts.append(replace(part, inner=tuple(inside.tolist())))
+    return found_parts
 
 
 def joined_tile(
@@ -577,14 +560,12 @@ def joined_tile(
         wanted = deepest if result is None else deepest | ~result.is_inside
         columns, rows = (np.where(wanted, axis, np.nan) for axis in places[k])
         tile = interpolated(parts[k].source, columns, rows, degree, parts[k].smoothing_px)
-        result = tile if result is None else _over(result, tile)
+        if result is not None:
+            samples = np.where(tile.is_inside[..., None], tile.samples, result.samples)
+            tile = Tile(samples, result.is_inside | tile.is_inside, result.clamped + tile.clamped)
+        result = tile
     assert result is not None  # a frame has at least one scan
     return result
-
-
-def _over(below: Tile, above: Tile) -> Tile:
-    samples = np.where(above.is_inside[..., None], above.samples, below.samples)
-    return Tile(samples, below.is_inside | above.is_inside, below.clamped + above.clamped)
 
 
 def _depth(part: Part, columns: Array, rows: Array) -> Array:

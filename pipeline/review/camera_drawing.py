@@ -2,7 +2,6 @@
 
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -19,7 +18,7 @@ from measure.scans.scan import Scan
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile, camera_text, parse_camera, read_camera
 from pipeline.files.camera_tables import DEFAULT_SIGMA_MM
-from pipeline.files.mark_table import SavePicture, picture_writer, template_values
+from pipeline.files.mark_table import picture_writer, template_values
 from pipeline.measuring.first_pictures import fit_clicks
 from pipeline.review.requests import parse_values
 from pipeline.text.files import write_atomically
@@ -228,14 +227,13 @@ def camera_content(drawing: CameraDrawing, placement: FramePlacement) -> dict[st
         content["frame_mm"] = list(frame_mm)
     if drawing.principal_distance_mm is not None:
         content["principal_distance_mm"] = drawing.principal_distance_mm
-    content["fiducial"] = [_fiducial(drawing, placement, one) for one in drawing.marks]
+    content["fiducial"] = []
+    for one in drawing.marks:
+        given = one.given_mm
+        sigma = DEFAULT_SIGMA_MM if given is None or drawing.sigma_mm is None else drawing.sigma_mm
+        xy_mm = list(given or placement.camera_mm(one.px))
+        content["fiducial"].append({"id": one.id, "xy_mm": xy_mm, "sigma_mm": sigma, "mark": MARK})
     return content
-
-
-def _fiducial(drawing: CameraDrawing, placement: FramePlacement, one: ClickedMark) -> dict[str, Any]:
-    given = one.given_mm
-    sigma = DEFAULT_SIGMA_MM if given is None or drawing.sigma_mm is None else drawing.sigma_mm
-    return {"id": one.id, "xy_mm": list(given or placement.camera_mm(one.px)), "sigma_mm": sigma, "mark": MARK}
 
 
 def drawn_camera(drawing: CameraDrawing, placement: FramePlacement, path: Path) -> CameraFile:
@@ -267,35 +265,25 @@ def save_drawing(drawing: CameraDrawing, placement: FramePlacement, scan: Scan, 
     if not frame_size_mm(drawing, placement):
         raise InputError("the frame's size is not known. Give it in mm, or click two of its opposite corners.")
     drawn_camera(drawing, placement, path).layout()
-    if drawing.is_picture:
-        mark = _chip_values(drawing, placement, scan, picture_writer(path.parent, f"{path.stem}-"))
-    else:
-        mark = dict(drawing.mark)
+    mark = dict(drawing.mark)
+    if drawing.is_picture:  # cut around the mark shown or the first one
+        size_mm = float(drawing.mark["size_mm"])
+        one = next((mark for mark in drawing.marks if mark.id == drawing.point), drawing.marks[0])
+        place = np.column_stack([placement.pixel_from_camera[:, :2], one.px])
+        learned = learn_template([cut(scan, place, size_mm)], size_mm)
+        chip = MarkTemplate(learned.image, learned.pitch_um, learned.origin_px, 0.0, "light", learned.detail_mm)
+        mark = template_values(chip, MARK, picture_writer(path.parent, f"{path.stem}-"))
     body = table_lines({**camera_content(drawing, placement), "mark": {MARK: mark}})
     write_atomically(path, "\n".join([*_remarks(drawing, placement), "", *body]) + "\n")
     return read_camera(path)
 
 
-def save_learned(camera: CameraFile, remarks: Sequence[str], path: Path) -> CameraFile:
+def save_learned(camera: CameraFile, image: str, path: Path) -> CameraFile:
     """Write a camera with marks learned from one scan, and read it again."""
+    remark = f"{_DRAWN_BY}: its marks were learned from their places in {_join_lines(image)}."
     text = camera_text(replace(camera, path=path, clicks=None), picture_writer(path.parent, f"{path.stem}-"))
-    write_atomically(path, "\n".join([*remarks, "", text]))
+    write_atomically(path, "\n".join([remark, "", text]))
     return read_camera(path)
-
-
-def learned_remarks(image: str) -> list[str]:
-    """Comment lines of a camera file whose marks were learned from one scan."""
-    return [f"{_DRAWN_BY}: its marks were learned from their places in {_join_lines(image)}."]
-
-
-def _chip_values(drawing: CameraDrawing, placement: FramePlacement, scan: Scan, save: SavePicture) -> dict[str, Any]:
-    """Content of the table of a mark that is an image patch, cut around the mark shown or the first one."""
-    size_mm = float(drawing.mark["size_mm"])
-    one = next((mark for mark in drawing.marks if mark.id == drawing.point), drawing.marks[0])
-    place = np.column_stack([placement.pixel_from_camera[:, :2], one.px])
-    learned = learn_template([cut(scan, place, size_mm)], size_mm)
-    chip = MarkTemplate(learned.image, learned.pitch_um, learned.origin_px, 0.0, "light", learned.detail_mm)
-    return template_values(chip, MARK, save)
 
 
 def _remarks(drawing: CameraDrawing, placement: FramePlacement) -> list[str]:

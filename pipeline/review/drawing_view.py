@@ -5,7 +5,7 @@ does not depend on the kind of mark: it shows handles and sends the place to whi
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -108,27 +108,22 @@ def drawing_json(drawing: camera_drawing.CameraDrawing, placement: camera_drawin
     """JSON of a drawing as shown on the page, without images."""
     shown = drawn_mark(drawing, placement)
     frame_mm = camera_drawing.frame_size_mm(drawing, placement)
+    kind, form = drawing.mark["kind"], []  # of the scalar keys, as in the mark's table in a camera file
+    for row in key_rows(MARK_TABLES["learned" if kind == "template" else kind]):
+        choices = _CHOICES.get(row.name, ())
+        if choices or row.type.startswith("number"):
+            value = drawing.mark.get(row.name, choices[0] if choices else 0.0)
+            form.append({"key": row.name, "unit": row.unit, "meaning": row.meaning, "choices": choices, "value": value})
     return {
         "mark": drawing.mark,
         "marks": [{**asdict(one), "found_mm": placement.camera_mm(one.px)} for one in drawing.marks],
         "pitch_um": list(placement.pitch_um),
         "pitch_source": placement.pitch_source,
         "frame_mm": None if frame_mm is None else list(frame_mm),
-        "form": _form(drawing.mark),
+        "form": form,
         "problem": shown.problem if shown else "",
         "shown": None if shown is None else _shown_json(drawing, shown),
     }
-
-
-def _form(mark: MarkJson) -> list[Json]:
-    """Form of the scalar keys of a mark, as in its table in a camera file."""
-    kind, form = mark["kind"], []
-    for row in key_rows(MARK_TABLES["learned" if kind == "template" else kind]):
-        choices = _CHOICES.get(row.name, ())
-        if choices or row.type.startswith("number"):
-            value = mark.get(row.name, choices[0] if choices else 0.0)
-            form.append({"key": row.name, "unit": row.unit, "meaning": row.meaning, "choices": choices, "value": value})
-    return form
 
 
 def _shown_json(drawing: camera_drawing.CameraDrawing, shown: DrawnMark) -> Json:
@@ -139,23 +134,20 @@ def _shown_json(drawing: camera_drawing.CameraDrawing, shown: DrawnMark) -> Json
         half = drawing.mark["size_mm"] / 2
         square = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
         lines = [place.apply(square).round(3).tolist()]
-    half_px = _half_px(shown, lines, place, own)
+    handles_px = [place.apply(np.array(one.place_mm)) for one in own]
+    points = [*(point for line in lines for point in line), *handles_px]
+    off = float(np.abs(np.array(points or [shown.clicked.px]) - shown.clicked.px).max())
+    if isinstance(shown.mark, MarkShape):
+        off = max(off, reach_px(shown.mark, shown.pixel_from_mark[:, :2]))
+    half_px = max(_LEAST_PX, math.ceil(_SIZES * off))
     return {
         "center": list(shown.clicked.px),
         "half": half_px,
         "start": list(window_start(shown.pixel_from_mark, half_px)),
         "outlines": lines,
-        "handles": [{"key": one.key, "px": place.apply(np.array(one.place_mm)).round(3).tolist()} for one in own],
+        "handles": [{"key": one.key, "px": px.round(3).tolist()} for one, px in zip(own, handles_px, strict=True)],
         "has_picture": isinstance(shown.mark, MarkShape),
     }
-
-
-def _half_px(shown: DrawnMark, lines: Sequence[Any], place: Affine, own: Sequence[Handle]) -> int:
-    points = [point for line in lines for point in line] + [place.apply(np.array(one.place_mm)) for one in own]
-    off = float(np.abs(np.array(points or [shown.clicked.px]) - shown.clicked.px).max())
-    if isinstance(shown.mark, MarkShape):
-        off = max(off, reach_px(shown.mark, shown.pixel_from_mark[:, :2]))
-    return max(_LEAST_PX, math.ceil(_SIZES * off))
 
 
 def _handle_affine(drawing: camera_drawing.CameraDrawing, shown: DrawnMark) -> Affine:
@@ -299,9 +291,7 @@ class DrawingAnswers:
             known = replace(project, pitch_um=placement.pitch_um, pose="auto")
             clicks = Clicks(drawing.image, {one.id: one.px for one in drawing.marks}, who=self._session.who)
             learned = camera_as_shown(known, camera, clicks)
-            return self._saved(
-                camera_drawing.save_learned(learned, camera_drawing.learned_remarks(drawing.image), path)
-            )
+            return self._saved(camera_drawing.save_learned(learned, drawing.image, path))
         scan = self._session.scan_location(drawing.image)
         return self._saved(
             self._pictures.compute(scan, lambda file: camera_drawing.save_drawing(drawing, placement, file, path))
@@ -315,7 +305,7 @@ class DrawingAnswers:
         camera = project.image_camera(given.image)
         check_clicks(camera, given.image, given.px)
         learned = camera_as_shown(project, camera, Clicks(given.image, given.px, who=self._session.who))
-        return self._saved(camera_drawing.save_learned(learned, camera_drawing.learned_remarks(given.image), path))
+        return self._saved(camera_drawing.save_learned(learned, given.image, path))
 
     def _saved(self, camera: CameraFile) -> Any:
         file, project = camera.path.name, self._session.project

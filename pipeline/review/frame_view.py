@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +10,6 @@ import numpy as np
 from measure.fiducials.options import Click
 from measure.marks.shapes import Bar, Disk, FrameCorner, LayoutMark, Mark, MarkShape, Part, Polygon, Ring
 from measure.results import MarkMeasurement
-from pipeline.archive.checked_results import Judging, latest
-from pipeline.archive.results_database import Store
-from pipeline.archive.schema import DamagedError
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.mark_table import Clicks
@@ -21,14 +17,12 @@ from pipeline.files.project_file import Project
 from pipeline.measuring.first_pictures import first_pictures
 from pipeline.measuring.scan_measurement import measured_scan
 from pipeline.measuring.scan_task import ScanTask, scan_tasks
-from pipeline.results.measured_record import FailureCode, MeasuredScan
+from pipeline.results.measured_record import MeasuredScan
 from pipeline.types import Array
 
 _STEPS = 48  # vertices of a circle
 Json = dict[str, Any]
 
-_NEAR = 100  # scans before and after, among which frames for comparison are sought
-_OTHERS = 6  # largest number of frames for comparison
 _LEAST_PX = 40  # px, smallest half width of a window, to include the surroundings
 _REACH_SIZES = 2.5  # width of a window in sizes of the mark
 
@@ -63,7 +57,7 @@ def _circle(center_mm: tuple[float, float], radius_mm: float) -> Array:
 
 
 @dataclass(frozen=True)
-class LookedAt:
+class ReviewFrame:
     """Frame with its result. verdict: of the cross-scan checks; fingerprint: of the result; camera: with the marks as
     used in the search."""
 
@@ -112,12 +106,16 @@ class LookedAt:
         """JSON of a mark with all details."""
         mark = self.mark(point, kind)
         drawn, linear = self.layout_marks.get(point), self.pixel_from_mark(point, kind)
+        second = None  # place by the second method
+        if mark.center_px is not None and "second_method_col_px" in mark.quality:
+            offset_px = (mark.quality["second_method_col_px"], mark.quality["second_method_row_px"])
+            second = np.add(mark.center_px, offset_px)
         return {
             **self._head_json(),
             **mark_json(mark),
             "place": _pair(self.place_px(point, kind)),
             "predicted": _pair(self.predicted_px(point, kind)),
-            "second": _second(mark),
+            "second": _pair(second),
             "half": self.window_px(point, kind),
             "covariance": None if mark.covariance_px2 is None else mark.covariance_px2.tolist(),
             "causes": _causes(mark),
@@ -157,54 +155,6 @@ class LookedAt:
         return mark.center_px if mark.center_px is not None else self.predicted_px(mark.point, mark.kind)
 
 
-class Looking:
-    """Access to the latest checked results in a results database, which another process may be writing."""
-
-    def __init__(self, store: Path, camera_of: Any) -> None:
-        """camera_of: returns the camera of an image."""
-        self._store, self._camera_of = store, camera_of
-
-    def judging(self) -> Judging | None:
-        if not self._store.exists():
-            return None
-        with Store(self._store) as store:
-            return latest(store)
-
-    def view(self, image: str) -> LookedAt:
-        """Load a frame. Raises KeyError for an image without checked results, DamagedError for a damaged result."""
-        with Store(self._store) as store:
-            judging = latest(store)
-            row = store.connection.execute(_ONE, (image, -1 if judging is None else judging.row)).fetchone()
-            if row is None or judging is None:
-                raise KeyError(image)
-            (scan,) = judging.scans({image})
-        if scan.failure and scan.failure.code is FailureCode.DAMAGED:
-            raise DamagedError(scan.failure.sentence)
-        return LookedAt(scan, str(row[0]), str(row[1]), self._camera_of(image))
-
-    def others(self, image: str, point: str, kind: str) -> Sequence[str]:
-        """Frames for comparison: nearby frames of the same camera in which the mark was measured."""
-        with Store(self._store) as store:
-            sql_parameters = (image, _NEAR, point, kind, _OTHERS)
-            rows = store.connection.execute(_NEARBY, sql_parameters).fetchall()
-        return [name for (name,) in rows]
-
-
-_ONE = "select verdict, fingerprint from checked_frame where name = ? and judging = ?"
-
-_NEARBY = """
-with own as (
-    select judging, scan, camera from checked_frame
-    where name = ?1 and judging = (select max(id) from judging)
-)
-select f.name from own join checked_frame f
-on f.judging = own.judging and f.scan between own.scan - ?2 and own.scan + ?2
-join mark m on m.result = f.result
-where f.camera = own.camera and f.name <> ?1 and m.point = ?3 and m.kind = ?4 and m.status = 'measured'
-order by abs(f.scan - own.scan) limit ?5
-"""
-
-
 def mark_json(mark: MarkMeasurement) -> Json:
     """JSON common to all marks."""
     return {
@@ -219,14 +169,6 @@ def mark_json(mark: MarkMeasurement) -> Json:
 
 def _pair(place: Array | None) -> list[float] | None:
     return None if place is None else [round(float(value), 4) for value in place]
-
-
-def _second(mark: MarkMeasurement) -> list[float] | None:
-    """Place of the mark by the second method; None without one."""
-    if mark.center_px is None or "second_method_col_px" not in mark.quality:
-        return None
-    offset = (mark.quality["second_method_col_px"], mark.quality["second_method_row_px"])
-    return _pair(mark.center_px + offset)
 
 
 def _causes(mark: MarkMeasurement) -> list[Json]:
@@ -250,15 +192,7 @@ def measured_from_clicks(project: Project, image: str, clicks: Sequence[Click]) 
 def measured_as_shown(project: Project, shown: str, px: Mapping[str, tuple[float, float]], image: str) -> MeasuredScan:
     """Measure the fiducials of a scan with templates learned at clicked places of a scan, which may be the same one.
 
-    Parameters
-    ----------
-    shown : scan from which the templates are learned.
-    px : column and row by mark.
-
-    Raises
-    ------
-    InputError
-        If a mark was not clicked.
+    shown, px: scan of the clicks, and column and row by mark. Raises InputError if a mark was not clicked.
     """
     camera = project.image_camera(shown)
     check_clicks(camera, shown, px)

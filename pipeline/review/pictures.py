@@ -107,15 +107,12 @@ def _window(scan: Scan, col0: int, row0: int, size: int) -> NDArray[np.uint8]:
     if col0 >= scan.width_px or row0 >= scan.height_px or col0 + size <= 0 or row0 + size <= 0:
         raise MeasurementError("the window is outside of the scan")
     step = max(1, size // _WINDOW_PX)
-    if step > 1:
-        return _reduced_window(scan, col0, row0, size // step, step)
-    shown = stretched(np.asarray(scan.window(col0, row0, size, size), dtype=np.float64))
-    shown[~scan.inside(col0, row0, size, size)] = _NOTHING
-    return shown
-
-
-def _reduced_window(scan: Scan, col0: int, row0: int, side: int, step: int) -> NDArray[np.uint8]:
-    """(side, side) means over squares of step x step pixels, read within the scan, one row of means at a time."""
+    if step == 1:
+        shown = stretched(np.asarray(scan.window(col0, row0, size, size), dtype=np.float64))
+        shown[~scan.inside(col0, row0, size, size)] = _NOTHING
+        return shown
+    # Means over squares of step x step pixels, read within the scan, one row of means at a time.
+    side = size // step
     shown = np.full((side, side), _NOTHING, np.uint8)
     extents = (col0, scan.width_px), (row0, scan.height_px)
     cols, rows = (_overlapping_pixels(*extent, side, step) for extent in extents)

@@ -11,7 +11,7 @@ import secrets
 import socket
 import sys
 import webbrowser
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import fields
 from importlib import resources
 from typing import Any
@@ -28,7 +28,7 @@ from measure.errors import MeasurementError
 from measure.fiducials.options import Click
 from measure.geometry import POSES
 from pipeline.errors import InputError
-from pipeline.files.decisions_file import Choice, Decision, LineError, parse_decision
+from pipeline.files.decisions_file import Choice, LineError, parse_decision
 from pipeline.files.mark_table import MARK_TABLES
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import sample_names
@@ -77,8 +77,14 @@ class Guard:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        answer = self._refusal(Request(scope))
-        await (answer or self._app)(scope, receive, _add_headers(send))
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                own = ((key.lower().encode(), value.encode()) for key, value in HEADERS.items())
+                message["headers"] = [*message["headers"], *own]
+            await send(message)
+
+        await (self._refusal(Request(scope)) or self._app)(scope, receive, send_with_headers)
 
     def _refusal(self, request: Request) -> Response | None:
         """Response to an unauthorised request, or the redirect that sets the cookie; None for an authorised request."""
@@ -102,16 +108,6 @@ def _refused(text: str) -> Response:
     return PlainTextResponse(text, status_code=403)
 
 
-def _add_headers(send: Send) -> Send:
-    async def sending(message: Message) -> None:
-        if message["type"] == "http.response.start":
-            own: Mapping[str, str] = HEADERS
-            message["headers"] = [*message["headers"], *((k.lower().encode(), v.encode()) for k, v in own.items())]
-        await send(message)
-
-    return sending
-
-
 class Server:
     """Review as a local web application."""
 
@@ -119,7 +115,15 @@ class Server:
         """port: 0 for any free port. Raises InputError if there are no checked results yet, or the port is in use."""
         self._session = Session(project, who)
         self._pictures = Pictures(project.max_pixels)
-        self._socket = _bound(port)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            self._socket.bind(("127.0.0.1", port))
+            self._socket.listen()  # requests sent before the server runs wait in the backlog
+        except OSError as error:
+            self._socket.close()
+            why = error.strerror or error
+            raise InputError(f"port {port}: {why}. Give another with --port, or 0 for any.") from None
         self.port: int = self._socket.getsockname()[1]
         token = secrets.token_urlsafe(24)
         self.address = f"http://127.0.0.1:{self.port}/?token={token}"
@@ -136,31 +140,16 @@ class Server:
 
 def serve(project: Project, port: int, who: str | None, opens_browser: bool, say: Callable[[str], None]) -> None:
     """Print the address on a line of its own, and serve until Ctrl-C. who: reviewer; None: the logged-in user."""
-    server = Server(project, port, who or _login_name())
+    try:
+        user = who or getpass.getuser()
+    except (OSError, KeyError):  # in a container the user may have no name
+        user = "somebody"
+    server = Server(project, port, user)
     say(server.address)
     sys.stdout.flush()
     if opens_browser:
         webbrowser.open(server.address)
     server.run()
-
-
-def _login_name() -> str:
-    try:
-        return getpass.getuser()
-    except (OSError, KeyError):  # in a container the user may have no name
-        return "somebody"
-
-
-def _bound(port: int) -> socket.socket:
-    own = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    own.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        own.bind(("127.0.0.1", port))
-        own.listen()  # requests sent before the server runs wait in the backlog
-    except OSError as error:
-        own.close()
-        raise InputError(f"port {port}: {error.strerror or error}. Give another with --port, or 0 for any.") from None
-    return own
 
 
 def _application(session: Session, pictures: Pictures) -> Starlette:
@@ -223,8 +212,8 @@ class _Answers:
 
     def mark(self, query: Query) -> Any:
         image, point, kind = query.get("image", ""), query.get("point", ""), query.get("kind", "")
-        view, session = self._session.looking.view(image), self._session
-        others = [session.looking.view(name) for name in session.looking.others(image, point, kind)]
+        view, session = self._session.view(image), self._session
+        others = [session.view(name) for name in session.similar_frames(image, point, kind)]
         return {
             **view.detail_json(point, kind),
             "decided": session.image_decisions(image),
@@ -240,7 +229,7 @@ class _Answers:
 
     def frame(self, query: Query) -> Any:
         image = query.get("image", "")
-        return {**self._session.looking.view(image).frame_json(), "decided": self._session.image_decisions(image)}
+        return {**self._session.view(image).frame_json(), "decided": self._session.image_decisions(image)}
 
     def camera(self, query: Query) -> Any:
         """Camera with marks to be learned: their names, and scans in which to click them."""
@@ -268,7 +257,7 @@ class _Answers:
         return self._pictures.window(self._scan(query), *place, whole(query, "size", 8, _WIDEST_PX))
 
     def residual(self, query: Query) -> bytes:
-        view = self._session.looking.view(query.get("image", ""))
+        view = self._session.view(query.get("image", ""))
         point, kind = query.get("point", ""), query.get("kind", "")
         matrix, blur_px = view.pixel_from_mark(point, kind), view.mark(point, kind).quality.get("blur_px", 0.0)
         if matrix is None or blur_px <= 0:
@@ -287,12 +276,16 @@ class _Answers:
 
     def decide(self, query: Query, body: Any) -> Any:
         given = parse_values(Decide, body)
-        self._session.decide(list(map(_decision, given.decisions)), given.key)
+        try:  # as lines of decisions.jsonl are
+            decisions = [parse_decision(json.dumps(one).encode()) for one in given.decisions]
+        except LineError as error:
+            raise InputError(f"the decision{error}") from None
+        self._session.decide(decisions, given.key)
         return self.queue(query)
 
     def measure(self, query: Query, body: Any) -> Any:
         given = parse_values(MeasureFrame, body)
-        self._session.looking.view(given.image)  # raises KeyError for an unknown image
+        self._session.view(given.image)  # raises KeyError for an unknown image
         clicks = [Click(one.point, one.col_px, one.row_px) for one in given.clicks]
         return _trial_json(measured_from_clicks(self._session.learned, given.image, clicks))
 
@@ -305,14 +298,6 @@ class _Answers:
 
     def _scan(self, query: Query) -> str:
         return self._session.scan_location(query.get("image", ""))
-
-
-def _decision(given: Mapping[str, Any]) -> Decision:
-    """Check a decision like a line of decisions.jsonl."""
-    try:
-        return parse_decision(json.dumps(given).encode())
-    except LineError as error:
-        raise InputError(f"the decision{error}") from None
 
 
 def _trial_json(scan: MeasuredScan) -> Any:
@@ -332,14 +317,19 @@ def _static(name: str) -> Callable[[Request], Response]:
 
 
 def _answering(answer: Callable[..., Any]) -> Callable[[Request], Any]:
-    """Handler of requests. answer: returns JSON or PNG from the query and, of a POST request, the body."""
+    """Handler of requests. answer: returns JSON or PNG from the query and, of a POST request, the body.
+
+    Errors of the user become messages; others are faults of the program.
+    """
 
     async def answering(request: Request) -> Response:
         try:
             given = [request.query_params, *([await _body(request)] if request.method == "POST" else [])]
             found = await anyio.to_thread.run_sync(answer, *given)
-        except Exception as error:
-            return _refusal(error)
+        except KeyError as error:
+            return PlainTextResponse(f"There is no {error.args[0]!r} here (any more).", 404)
+        except (InputError, MeasurementError, OSError, TypeError, ValueError) as error:
+            return PlainTextResponse(str(error), 400)
         return Response(found, media_type="image/png") if isinstance(found, bytes) else JSONResponse(found)
 
     return answering
@@ -352,13 +342,3 @@ async def _body(request: Request) -> Any:
         if len(data) > _LARGEST_BODY:
             raise InputError("that is too much for one request.")
     return parse_json(data)
-
-
-def _refusal(error: Exception) -> Response:
-    """Response with a message for the user; raises other errors, which are faults of the program."""
-    match error:
-        case KeyError():
-            return PlainTextResponse(f"There is no {error.args[0]!r} here (any more).", 404)
-        case InputError() | MeasurementError() | OSError() | TypeError() | ValueError():
-            return PlainTextResponse(str(error), 400)
-    raise error

@@ -18,20 +18,24 @@ from typing import Any, NamedTuple
 
 from measure.flags import Code, Status
 from measure.scans.remote import fetch_location
+from pipeline.archive.checked_results import Judging, latest
 from pipeline.archive.results_database import Store
-from pipeline.archive.schema import check_judging, damaged_frames, damaged_result
+from pipeline.archive.schema import DamagedError, check_judging, damaged_frames, damaged_result
 from pipeline.archive.verdicts import Verdict
 from pipeline.errors import InputError
 from pipeline.files import decisions_file
 from pipeline.files.project_file import Project, reload_decisions
 from pipeline.measuring.learn_stage import add_learned_marks
 from pipeline.provenance import FileState, content_hash, file_state
-from pipeline.review.frame_view import Looking
+from pipeline.results.measured_record import FailureCode
+from pipeline.review.frame_view import ReviewFrame
 
 Json = dict[str, Any]
 
 _NONE = -1  # no cross-scan checks yet
 PAGE = 100  # entries sent at a time
+_NEAR = 100  # scans before and after, among which frames for comparison are sought
+_OTHERS = 6  # largest number of frames for comparison
 _UNKNOWN = "how its marks look is not known: click each of them in one scan that shows them well."
 _COMMON = (
     "its marks were learned from what its scans have in common. Click them in one scan to learn them again from it."
@@ -147,6 +151,21 @@ select result, count(*) from checked_mark where judging = ? and status in ('meas
 """
 
 
+_CHECKED = "select verdict, fingerprint from checked_frame where name = ? and judging = ?"
+
+_NEARBY = """
+with own as (
+    select judging, scan, camera from checked_frame
+    where name = ?1 and judging = (select max(id) from judging)
+)
+select f.name from own join checked_frame f
+on f.judging = own.judging and f.scan between own.scan - ?2 and own.scan + ?2
+join mark m on m.result = f.result
+where f.camera = own.camera and f.name <> ?1 and m.point = ?3 and m.kind = ?4 and m.status = 'measured'
+order by abs(f.scan - own.scan) limit ?5
+"""
+
+
 def _frames(db: sqlite3.Connection, judging: int) -> Iterator[_Frame]:
     found: dict[int, int] = dict(db.execute(_FOUND, (judging,)).fetchall())
     for *frame, pose_json in db.execute(_FRAMES, (judging,)):
@@ -217,10 +236,10 @@ class Session:
 
     def __init__(self, project: Project, who: str) -> None:
         """Raises InputError if there are no checked results and no scans, or results of a camera whose file is gone."""
-        self.project, self.who = project, who
+        self.project = self.learned = project  # learned: with the marks that its scans have in common
+        self.who = who
         self.folder = project.path.resolve().parent
-        self.looking = Looking(project.measurement_path, lambda image: self.learned.image_camera(image))
-        if project.missing_camera and self.looking.judging() is not None:
+        if project.missing_camera and self._latest_judging() is not None:
             raise InputError(
                 f"{self.folder / project.missing_camera}: there is no such file, but its marks are in "
                 f"{project.measurement_path}. Put the file back; or delete that database, and draw the camera."
@@ -237,14 +256,21 @@ class Session:
     def refresh(self) -> None:
         """Update the queue and its answers from the results database and the decisions file."""
         with self._lock:
-            judging = self.looking.judging()
+            judging = self._latest_judging()
             row = _NONE if judging is None else judging.row
             path = self.project.decisions_path
             before, self._file_state = self._file_state, file_state(path, self.folder)
-            if row != self._judging:
-                self._take_queue(row)
-            elif self._file_state == before:
+            if row == self._judging and self._file_state == before:
                 return
+            if row != self._judging:
+                self.project = self.learned = reload_decisions(self.project)
+                if row == _NONE:
+                    queue = build_queue(self.project, None, row)
+                else:
+                    with Store(self.project.measurement_path) as store:
+                        self.learned = add_learned_marks(self.project, store)
+                        queue = build_queue(self.project, store.connection, row)
+                self._by_key, self._judging = {entry.key: entry for entry in queue}, row
             decisions = decisions_file.read_decisions(path)
             self._standing = decisions_file.standing(decisions)
             self._learned = [one for one in decisions if one.subject[2] == decisions_file.LEARNED]
@@ -266,7 +292,10 @@ class Session:
                 entry = self._by_key[key]
                 frames = tuple(zip(entry.images, entry.fingerprints, strict=True))
                 decisions = [replace(one, image=image, fingerprint=own) for one in decisions for image, own in frames]
-            complete = [replace(self._add_fingerprint(one), who=self.who, when=when) for one in decisions]
+            complete = [replace(one, who=self.who, when=when) for one in decisions]
+            for at, one in enumerate(complete):
+                if one.decision is decisions_file.Choice.LEARN:  # it applies to this file of the scan only
+                    complete[at] = replace(one, fingerprint=content_hash(self.project.scans[one.image]))
             decisions_file.append_decisions(self.project.decisions_path, complete)
             self.refresh()
 
@@ -314,20 +343,51 @@ class Session:
         return self._by_key[key]
 
     def entry_json(self, entry: Entry) -> Json:
-        answer = self._answers.get(entry.key)
+        answer, old = self._answers.get(entry.key), None
+        if entry.question not in (Question.CAMERA, Question.FRAME):
+            one = self._standing.get((entry.images[0], entry.point, entry.kind))
+            old = None if one is None or _names_result(one, entry.fingerprints[0]) else one  # on an earlier result
         return {
             **{name: getattr(entry, name) for name in _SHOWN},
             "image": entry.images[0],
             "count": len(entry.images),
             "fingerprint": entry.fingerprints[0] if entry.fingerprints else "",
             "answer": None if answer is None else _answer_json(answer),
-            "old": self._old_json(entry),
+            "old": None if old is None else _answer_json(old),
         }
+
+    def view(self, image: str) -> ReviewFrame:
+        """Load a frame from the results database, which another process may be writing.
+
+        Raises KeyError for an image without checked results, DamagedError for a damaged result.
+        """
+        with Store(self.project.measurement_path) as store:
+            judging = latest(store)
+            row = store.connection.execute(_CHECKED, (image, _NONE if judging is None else judging.row)).fetchone()
+            if row is None or judging is None:
+                raise KeyError(image)
+            (scan,) = judging.scans({image})
+        if scan.failure and scan.failure.code is FailureCode.DAMAGED:
+            raise DamagedError(scan.failure.sentence)
+        return ReviewFrame(scan, str(row[0]), str(row[1]), self.learned.image_camera(image))
+
+    def similar_frames(self, image: str, point: str, kind: str) -> list[str]:
+        """Frames for comparison: nearby frames of the same camera in which the mark was measured."""
+        with Store(self.project.measurement_path) as store:
+            rows = store.connection.execute(_NEARBY, (image, _NEAR, point, kind, _OTHERS)).fetchall()
+        return [name for (name,) in rows]
+
+    def _latest_judging(self) -> Judging | None:
+        path = self.project.measurement_path
+        if not path.exists():
+            return None
+        with Store(path) as store:
+            return latest(store)
 
     def scan_location(self, image: str) -> str:
         """Path or address of an image's file. Raises KeyError for an unknown image."""
         given = self.project.scans.get(image)
-        return self.looking.view(image).scan.scan if given is None else fetch_location(given)
+        return self.view(image).scan.scan if given is None else fetch_location(given)
 
     def image_decisions(self, image: str) -> list[Json]:
         """JSON of the decisions in force on a frame."""
@@ -337,16 +397,6 @@ class Session:
     def _scan_decisions(self, image: str) -> list[decisions_file.Decision]:
         """Decisions in force on the marks and the pose of an image."""
         return [one for one in self._of_image.get(image, ()) if one.subject[2] != decisions_file.LEARNED]
-
-    def _take_queue(self, judging: int) -> None:
-        self.project = self.learned = reload_decisions(self.project)
-        if judging == _NONE:
-            queue = build_queue(self.project, None, judging)
-        else:
-            with Store(self.project.measurement_path) as store:
-                self.learned = add_learned_marks(self.project, store)
-                queue = build_queue(self.project, store.connection, judging)
-        self._by_key, self._judging = {entry.key: entry for entry in queue}, judging
 
     def _find_answer(self, entry: Entry) -> decisions_file.Decision | None:
         """Decision that answers a question; None if it is open."""
@@ -371,18 +421,6 @@ class Session:
             first = first or one
         return first
 
-    def _old_json(self, entry: Entry) -> Json | None:
-        """JSON of a decision on an earlier result; None if there is none."""
-        if entry.question in (Question.CAMERA, Question.FRAME):
-            return None
-        one = self._standing.get((entry.images[0], entry.point, entry.kind))
-        return None if one is None or _names_result(one, entry.fingerprints[0]) else _answer_json(one)
-
-    def _add_fingerprint(self, one: decisions_file.Decision) -> decisions_file.Decision:
-        """Add the fingerprint of the scan to a decision to learn marks, so that it applies to this file only."""
-        is_learned = one.decision is decisions_file.Choice.LEARN
-        return replace(one, fingerprint=content_hash(self.project.scans[one.image])) if is_learned else one
-
     def _check(self, one: decisions_file.Decision) -> None:
         """Check that image and mark exist and the decision is possible. Raises InputError otherwise."""
         if one.subject[2] == decisions_file.LEARNED:
@@ -394,7 +432,7 @@ class Session:
                 raise InputError(f"{one.image}: click {marks}: all marks of its camera, and no others.")
             return
         try:
-            view = self.looking.view(one.image)
+            view = self.view(one.image)
             mark = view.mark(one.point, one.subject[2]) if one.point else None
         except KeyError as error:
             raise InputError(f"there is no image or mark {error.args[0]!r}.") from None
