@@ -209,9 +209,6 @@ class Frame:
     marks: tuple[Mark, ...]
     scan: MeasuredScan | None = None
 
-    def count(self, *statuses: Status) -> int:
-        return sum(mark.status in statuses for mark in self.marks)
-
     @property
     def verdict(self) -> Verdict:
         """Verdict as in `reseau status`, for the marks currently in comparator.csv."""

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from measure.annotations.lines import Line
 from measure.flags import Status
@@ -69,8 +68,13 @@ def mark_picture(mark: Mark, thumbnail: Thumbnail, px_per_um: float, most_px: fl
     rows, cols = thumbnail.pixels.shape
     zoom = SIZE_PX / (max(rows, cols) * thumbnail.step_px)  # page pixels to a pixel of the scan
     width, height = cols * thumbnail.step_px * zoom, rows * thumbnail.step_px * zoom
-    image = svg.tag("image", href=_png_uri(thumbnail.pixels, most_px), width=width, height=height, class_="chip")
-    drawn = [image]
+    stretched = stretch(thumbnail.pixels)
+    if max(rows, cols) > most_px:
+        factor = most_px / max(rows, cols)
+        stretched = np.asarray(cv2.resize(stretched, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
+    _, png = cv2.imencode(".png", np.rint(stretched).astype(np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    address = "data:image/png;base64," + base64.b64encode(png.tobytes()).decode("ascii")
+    drawn = [svg.tag("image", href=address, width=width, height=height, class_="chip")]
     if mark.center_px is not None:
         # The centre of the top-left thumbnail pixel lies half a thumbnail pixel inside the picture's edge.
         center = (mark.center_px - thumbnail.origin_px + 0.5 * thumbnail.step_px) * zoom
@@ -82,16 +86,6 @@ def mark_picture(mark: Mark, thumbnail: Thumbnail, px_per_um: float, most_px: fl
             drawn.append(_arrow(center, mark.residual, px_per_um))
     title = f"{mark.kind} {mark.point} in {mark.image}, {mark.status}: the scan about its measured centre"
     return svg.picture(SIZE_PX, SIZE_PX, title, *drawn, class_="thumb")
-
-
-def _png_uri(pixels: NDArray[np.generic], most_px: float) -> str:
-    """Encode stretched grey values as an 8-bit PNG data URI."""
-    stretched = stretch(pixels)
-    if max(pixels.shape) > most_px:
-        factor = most_px / max(pixels.shape)
-        stretched = np.asarray(cv2.resize(stretched, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
-    _, data = cv2.imencode(".png", np.rint(stretched).astype(np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode("ascii")
 
 
 def _arrow(start: Array, residual: ResidualRecord, px_per_um: float) -> Markup:
@@ -259,6 +253,6 @@ def _observed_share(marks: list[Mark]) -> str:
     if not marks:
         return "–"
     counts = {status: sum(mark.status is status for mark in marks) for status in Status}
-    observed = counts[Status.MEASURED] + counts[Status.WEAK]
+    observed = sum(mark.status.is_observation for mark in marks)
     others = ", ".join(f"{n} {status}" for status, n in counts.items() if n and status is not Status.MEASURED)
     return f"{observed} of {len(marks)}" + (f" ({others})" if others else "")

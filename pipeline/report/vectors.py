@@ -155,18 +155,25 @@ def coverage_plot(on: Plane, places_mm: Array) -> Markup:
 def contour_plot(on: Plane, x_mm: Array, y_mm: Array, sigma_um: Array, title: str) -> Markup | None:
     """Plot contours of a standard deviation over a frame, labelled in the plane's unit; None if it is 0 everywhere.
 
+    Levels are round: equally spaced, or 1, 2, 5 times powers of ten if the range exceeds a factor of five.
+
     Parameters
     ----------
     x_mm, y_mm : (m,), (n,) the grid, ascending
     sigma_um : (n, m) at its nodes, NaN where the camera forms no image
     """
     sigma = on.unit.per_um * sigma_um
-    high = float(np.nanmax(sigma, initial=0.0))
+    low, high = float(np.nanmin(sigma, initial=np.inf)), float(np.nanmax(sigma, initial=0.0))
     if not high > 0.0:
         return None
+    if high > 5.0 * low:
+        powers = 10.0 ** np.arange(np.floor(np.log10(max(low, 1e-3 * high))), np.ceil(np.log10(high)) + 1.0)
+        levels = [float(f"{m * power:.3g}") for power in powers for m in (1.0, 2.0, 5.0) if low < m * power < high]
+    else:
+        levels = [float(f"{each:.6g}") for each in svg.ticks(low, high, LEVELS)]
     drawn, labels = [], list[tuple[float, float, str]]()
     (left, bottom), (right, top) = on.page(on.corners_mm + EDGE * np.ptp(on.corners_mm, axis=0) * [[1.0], [-1.0]])
-    for level in _levels(float(np.nanmin(sigma)), high):
+    for level in levels:
         for line in find_contours(sigma, level):
             nodes = zip(line.T[::-1], (x_mm, y_mm), strict=True)
             page = on.page(np.stack([np.interp(at, np.arange(len(axis)), axis) for at, axis in nodes], axis=1))
@@ -177,11 +184,3 @@ def contour_plot(on: Plane, x_mm: Array, y_mm: Array, sigma_um: Array, title: st
                 labels.append((*free[len(free) // 2], f"{level:g}"))
     names = [svg.words(px, py + 4.0, text, "contour-label", "middle") for px, py, text in labels]
     return on.picture(title, None, *drawn, *names)
-
-
-def _levels(low: float, high: float) -> list[float]:
-    """Round contour levels: equally spaced, or 1, 2, 5 times powers of ten if the range exceeds a factor of five."""
-    if high > 5.0 * low:
-        powers = 10.0 ** np.arange(np.floor(np.log10(max(low, 1e-3 * high))), np.ceil(np.log10(high)) + 1.0)
-        return [float(f"{m * power:.3g}") for power in powers for m in (1.0, 2.0, 5.0) if low < m * power < high]
-    return [float(f"{each:.6g}") for each in svg.ticks(low, high, LEVELS)]

@@ -412,5 +412,5 @@ def _observed(data: ReportData, shots: list[Frame]) -> int:
     """Number of observed marks; from the adjustment if there is no comparator file."""
     if data.totals:
         return sum(count[status] for count in data.totals.marks.values() for status in (Status.MEASURED, Status.WEAK))
-    marks = sum(frame.count(Status.MEASURED, Status.WEAK) for frame in shots)
+    marks = sum(mark.status.is_observation for frame in shots for mark in frame.marks)
     return marks or (len(data.adjustment.residuals) if data.adjustment else 0)

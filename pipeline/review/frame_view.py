@@ -110,6 +110,9 @@ class ReviewFrame:
         if mark.center_px is not None and "second_method_col_px" in mark.quality:
             offset_px = (mark.quality["second_method_col_px"], mark.quality["second_method_row_px"])
             second = np.add(mark.center_px, offset_px)
+        parts = mark.covariance.parts.items() if mark.covariance else ()
+        parts_px = [(c.shown, c.meaning, float(np.sqrt(max(np.trace(px2) / 2, 0.0)))) for c, px2 in parts]
+        parts_px.sort(key=lambda one: -one[2])  # the largest first
         return {
             **self._head_json(),
             **mark_json(mark),
@@ -118,7 +121,7 @@ class ReviewFrame:
             "second": _pair(second),
             "half": self.window_px(point, kind),
             "covariance": None if mark.covariance_px2 is None else mark.covariance_px2.tolist(),
-            "causes": _causes(mark),
+            "causes": [{"cause": cause, "meaning": meaning, "sigma_px": px} for cause, meaning, px in parts_px],
             "quality": {name: value for name, value in mark.quality.items() if np.isfinite(value)},
             "outlines": [] if drawn is None or linear is None else outlines_px(drawn.mark, linear),
             "has_residual": linear is not None and mark.quality.get("blur_px", 0.0) > 0,
@@ -169,13 +172,6 @@ def mark_json(mark: MarkMeasurement) -> Json:
 
 def _pair(place: Array | None) -> list[float] | None:
     return None if place is None else [round(float(value), 4) for value in place]
-
-
-def _causes(mark: MarkMeasurement) -> list[Json]:
-    """Contributions to the standard deviation, the largest first."""
-    parts = mark.covariance.parts.items() if mark.covariance else ()
-    parts_px = [(c.shown, c.meaning, float(np.sqrt(max(np.trace(px2) / 2, 0.0)))) for c, px2 in parts]
-    return [{"cause": c, "meaning": m, "sigma_px": s} for c, m, s in sorted(parts_px, key=lambda one: -one[2])]
 
 
 def measured_from_clicks(project: Project, image: str, clicks: Sequence[Click]) -> MeasuredScan:
