@@ -76,12 +76,6 @@ class BlockScan:
     width_px: int
     height_px: int
 
-    def depths_px(self, pixels: Array) -> Array:
-        """(n,) distances of pixels (n, 2) from the nearest edge of the scan, px; negative outside."""
-        col, row = pixels.T
-        edges = [col + 0.5, self.width_px - 0.5 - col, row + 0.5, self.height_px - 0.5 - row]
-        return np.asarray(np.min(edges, axis=0))
-
 
 @dataclass(frozen=True)
 class BlockPicture:
@@ -103,9 +97,14 @@ class BlockPicture:
     def scan_place(self, camera_mm: Array) -> tuple[BlockScan, Array] | None:
         """Scan in which a place (2,) of the camera frame is farthest from the edges, and its pixel (2,); None where no
         transformation succeeds."""
+
+        def depth_px(place: tuple[BlockScan, Array]) -> float:
+            """Distance from the nearest edge of the scan; negative outside."""
+            scan, (col, row) = place
+            return float(min(col + 0.5, scan.width_px - 0.5 - col, row + 0.5, scan.height_px - 0.5 - row))
+
         candidates = [(scan, scan.chain.scan_from_frame(camera_mm[None])) for scan in self.scans]
-        places = [(scan, pixels[0]) for scan, (pixels, found) in candidates if found[0]]
-        return max(places, key=lambda place: place[0].depths_px(place[1][None])[0], default=None)
+        return max(((scan, pixels[0]) for scan, (pixels, found) in candidates if found[0]), key=depth_px, default=None)
 
 
 @dataclass(frozen=True)
@@ -224,17 +223,16 @@ def chosen_tracks(mapped: Mapped, pictures: Mapping[str, BlockPicture], precisio
     taken: dict[tuple[str, int, int], int] = defaultdict(int)
     chosen = []
     for number in usable:
-        cells = [_cell(pictures[sight.image], sight.col, sight.row) for sight in mapped.tracks[number]]
+        cells = []
+        for sight in mapped.tracks[number]:
+            picture = pictures[sight.image]
+            column = int(CELLS * sight.col / picture.lattice.width_px)
+            cells.append((picture.image, column, int(CELLS * sight.row / picture.lattice.height_px)))
         if any(taken[cell] < A_CELL for cell in cells):
             chosen.append(number)
             for cell in cells:
                 taken[cell] += 1
     return sorted(chosen)
-
-
-def _cell(picture: BlockPicture, col: float, row: float) -> tuple[str, int, int]:
-    lattice = picture.lattice
-    return picture.image, int(CELLS * col / lattice.width_px), int(CELLS * row / lattice.height_px)
 
 
 def oriented_by_control(
@@ -423,16 +421,12 @@ def write_pictures(
             path.parent.mkdir(parents=True, exist_ok=True)
             if not cv2.imwrite(str(path), content):
                 raise InputError(f"{path}: cannot be written. Make room there, or set another output folder.")
-        made.append(BlockPicture(task.image, task.camera, name, lattice, _scans(task)))
+        scans = []
+        for each in task.scans:
+            with open_scan(each.scan, task.max_pixels) as scan:
+                scans.append(BlockScan(each.image, each.chain, scan.width_px, scan.height_px))
+        made.append(BlockPicture(task.image, task.camera, name, lattice, tuple(scans)))
     return tuple(made)
-
-
-def _scans(task: ResampleTask) -> tuple[BlockScan, ...]:
-    scans = []
-    for each in task.scans:
-        with open_scan(each.scan, task.max_pixels) as scan:
-            scans.append(BlockScan(each.image, each.chain, scan.width_px, scan.height_px))
-    return tuple(scans)
 
 
 def _cut(path: Path, lattice: Canvas) -> tuple[Array, Mask]:
@@ -475,8 +469,8 @@ def _eight_bits(picture: Array, mask: Mask) -> Picture:
 
 
 def mapped(pictures: Sequence[BlockPicture], cameras: dict[str, CameraFile], folder: Path) -> Mapped:
-    """Run COLMAP and return the largest part of the block that it orients. Raises InputError where it orients
-    nothing."""
+    """Run COLMAP with fixed cameras and return the largest part of the block that it orients. Raises InputError where
+    it orients nothing."""
     pycolmap = quiet_colmap()
     database = folder / "colmap.db"
     for left in folder.glob("colmap.db*"):
@@ -484,20 +478,12 @@ def mapped(pictures: Sequence[BlockPicture], cameras: dict[str, CameraFile], fol
     for camera in dict.fromkeys(picture.camera for picture in pictures):
         own = [picture for picture in pictures if picture.camera == camera]
         _extract(pycolmap, database, folder, own, cameras[camera])
-    _match(pycolmap, database, len(pictures))
-    return _run_mapping(pictures, folder)
-
-
-def quiet_colmap() -> Any:
-    """pycolmap, without its log: what fails raises."""
-    pycolmap = import_pycolmap("reseau block")
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
-    return pycolmap
-
-
-def _run_mapping(pictures: Sequence[BlockPicture], folder: Path) -> Mapped:
-    """Estimate poses and points from the matches in the database, with fixed cameras."""
-    pycolmap = quiet_colmap()
+    if len(pictures) <= _EXHAUSTIVE:
+        pycolmap.match_exhaustive(str(database), device=pycolmap.Device.cpu)
+    else:
+        pairing = pycolmap.SequentialPairingOptions()
+        pairing.overlap = _NEIGHBOURS
+        pycolmap.match_sequential(str(database), pairing_options=pairing, device=pycolmap.Device.cpu)
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = SEED
     options.min_model_size = 3
@@ -506,14 +492,21 @@ def _run_mapping(pictures: Sequence[BlockPicture], folder: Path) -> Mapped:
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     sparse = folder / "sparse"
     sparse.mkdir(exist_ok=True)
-    models = pycolmap.incremental_mapping(str(folder / "colmap.db"), str(folder / "pictures"), str(sparse), options)
+    models = pycolmap.incremental_mapping(str(database), str(folder / "pictures"), str(sparse), options)
     if not models:
         raise InputError(
             "COLMAP orients no two of these frames. Give frames that overlap by half or more, or orientations in "
             "images.csv and `reseau run`."
         )
     model = max(models.values(), key=lambda model: model.num_reg_images())
-    return read_model(model, pycolmap.Database.open(str(folder / "colmap.db")), pictures)
+    return read_model(model, pycolmap.Database.open(str(database)), pictures)
+
+
+def quiet_colmap() -> Any:
+    """pycolmap, without its log: what fails raises."""
+    pycolmap = import_pycolmap("reseau block")
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    return pycolmap
 
 
 def read_model(model: Any, database: Any, pictures: Sequence[BlockPicture]) -> Mapped:
@@ -575,13 +568,3 @@ def given_interior(camera: CameraFile) -> Array:
     if camera.principal_distance_mm is None:
         raise InputError(f"{camera.path}: principal_distance_mm is missing: COLMAP needs about the right one. Give it.")
     return np.array([camera.principal_distance_mm, *(camera.principal_point_mm or (0.0, 0.0))])
-
-
-def _match(pycolmap: Any, database: Path, images: int) -> None:
-    device = pycolmap.Device.cpu
-    if images <= _EXHAUSTIVE:
-        pycolmap.match_exhaustive(str(database), device=device)
-        return
-    pairing = pycolmap.SequentialPairingOptions()
-    pairing.overlap = _NEIGHBOURS
-    pycolmap.match_sequential(str(database), pairing_options=pairing, device=device)

@@ -169,7 +169,8 @@ def _calibrated(
             try:
                 if any(turned is None for turned in camera.turned_deg.values()):
                     camera = find_turns(project, own, camera)
-                    pictures = pictures.with_camera(camera)
+                    cameras = (camera if each.name == camera.name else each for each in pictures.cameras)
+                    pictures = replace(pictures, cameras=tuple(cameras))
                     project = write_project(out, pictures, options, lenses)
                 _check_count(camera, left_out)
                 adjustment, choice = adjust_marks(project, own), None
@@ -178,7 +179,12 @@ def _calibrated(
                     if choice.model != first:
                         lenses[camera.name] = choice.model
                         adjustment = adjust_marks(write_project(out, pictures, options, lenses), own)
-                _check_solution(adjustment)
+                if not adjustment.converged:
+                    why = " ".join(adjustment.warnings[:1])
+                    raise InputError(
+                        f"the adjustment has no solution ({adjustment.termination}). {why} Take pictures with the "
+                        "board tilted by 20 degrees and more in different directions, all over the picture."
+                    )
                 adjustments[camera.name], choices[camera.name] = adjustment, choice
             except (AdjustmentError, InputError) as error:
                 not_calibrated[camera.name] = str(error)
@@ -250,16 +256,6 @@ def _chosen_lens(
     alike = replace(first.network, observations=replace(observations, covariance_mm2=covariance))
     adjusted = partial(adjust, options=adjustment_options(project.adjust))
     return choose_lens(alike, options.square_pixels, options.pixel_mm, adjusted, first.start)
-
-
-def _check_solution(adjustment: Adjustment) -> None:
-    """Raise InputError where an adjustment has no solution."""
-    if not adjustment.converged:
-        why = " ".join(adjustment.warnings[:1])
-        raise InputError(
-            f"the adjustment has no solution ({adjustment.termination}). {why} Take pictures with the board tilted by "
-            "20 degrees and more in different directions, all over the picture."
-        )
 
 
 def _nothing(pictures: BoardPictureFiles, left_out: Mapping[str, str], not_calibrated: Mapping[str, str]) -> str:

@@ -1,6 +1,6 @@
 """Intrinsics of a calibrated digital camera in pixels, with standard deviations and the data they are based on."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any, Literal
@@ -166,12 +166,6 @@ class CameraIntrinsics:
     def is_fisheye(self) -> bool:
         return self.family == "opencv_fisheye"
 
-    def covariance_matrix(self, names: Sequence[str]) -> Array:
-        """(n, n) covariance of some values; 0 for those that were not estimated."""
-        rows = [list(self.values).index(name) if name in self.values else -1 for name in names]
-        known = np.pad(self.covariance, (0, 1))
-        return np.asarray(known[np.ix_(rows, rows)])
-
     def __repr__(self) -> str:
         centre = ", ".join(
             f"{name} {each.value:.2f} ± {each.sigma:.2f}" for name, each in self.values.items() if name in CENTRE
@@ -180,6 +174,13 @@ class CameraIntrinsics:
 
     def as_json(self) -> dict[str, Any]:
         values = {name: each.as_json() for name, each in self.values.items()}
+        # OpenCV's calibration of the same points, and of its own corners
+        opencv: dict[str, Any] = {"verdict": "not possible", "reason": "the camera was not checked"}
+        if self.check is not None:
+            opencv = {"verdict": self.check.verdict, "reason": self.check.reason}
+            if self.check.corners_px is not None:
+                opencv |= _pixels(self.check.corners_px.reseau)
+                opencv["own_corners"] = _pixels(self.check.corners_px.opencv)
         return {
             "name": self.pictures.name,
             "image_size_px": [self.pictures.width_px, self.pictures.height_px],
@@ -192,18 +193,8 @@ class CameraIntrinsics:
             "correlations": [{"of": [a, b], "value": value} for a, b, value in self.correlations],
             **{name: getattr(self, name) for name in _FIGURES},
             "lens_rms_px": {} if self.lens is None else dict(self.lens.rms_px),
-            "opencv": self._opencv_json(),
+            "opencv": opencv,
         }
-
-    def _opencv_json(self) -> dict[str, Any]:
-        """OpenCV's calibration of the same points, and of its own corners."""
-        if self.check is None:
-            return {"verdict": "not possible", "reason": "the camera was not checked"}
-        shown: dict[str, Any] = {"verdict": self.check.verdict, "reason": self.check.reason}
-        if self.check.corners_px is not None:
-            shown |= _pixels(self.check.corners_px.reseau)
-            shown["own_corners"] = _pixels(self.check.corners_px.opencv)
-        return shown
 
     def print(self, console: Console) -> None:
         """Print the camera as a table, then the data it is based on."""
@@ -293,6 +284,8 @@ def camera_intrinsics(
     v_px = adjustment.residuals.v_mm / pixel_mm
     reach = adjustment.lens_reach(camera, (pictures.width_px * pixel_mm, pictures.height_px * pixel_mm))
     correlation = covariance / np.outer(sigmas, sigmas)
+    images, rows = np.unique(np.array(adjustment.network.observations.image), return_inverse=True)
+    image_rms_px = np.sqrt(np.bincount(rows, (v_px**2).sum(axis=1)) / np.bincount(rows))
     return CameraIntrinsics(
         pictures=pictures,
         family=camera.distortion.family,
@@ -309,7 +302,7 @@ def camera_intrinsics(
         left_out=left_out,
         used=len(adjustment.network.images),
         rms_px=float(np.sqrt((v_px**2).sum(axis=1).mean())),
-        worst=_worst_images(adjustment.network.observations.image, v_px),
+        worst=tuple((str(images[row]), float(image_rms_px[row])) for row in np.argsort(-image_rms_px)[:_WORST]),
         sigma0=adjustment.sigma0,
         corner_sigma_px=float(np.sqrt(np.median(np.maximum(given_mm2, 0.0)))) / pixel_mm,
         unmodelled_sigma_px=unmodelled_mm / pixel_mm,
@@ -318,13 +311,6 @@ def camera_intrinsics(
         pitch_um=pitch_um,
         check=check,
     )
-
-
-def _worst_images(images: Sequence[str], v_px: Array) -> tuple[tuple[str, float], ...]:
-    """Images with the largest rms residual vectors (px)."""
-    names, rows = np.unique(np.array(images), return_inverse=True)
-    rms_px = np.sqrt(np.bincount(rows, (v_px**2).sum(axis=1)) / np.bincount(rows))
-    return tuple((str(names[row]), float(rms_px[row])) for row in np.argsort(-rms_px)[:_WORST])
 
 
 def _pixels(calibration: PixelCalibration) -> dict[str, float]:

@@ -65,10 +65,6 @@ class BoardPictureFiles:
     cameras: tuple[CameraPictures, ...]
     unreadable: Mapping[str, str]
 
-    def with_camera(self, camera: CameraPictures) -> "BoardPictureFiles":
-        """Replace the camera of the same name."""
-        return replace(self, cameras=tuple(camera if each.name == camera.name else each for each in self.cameras))
-
 
 def find_pictures(given: Sequence[Path], out: Path) -> BoardPictureFiles:
     """Find the images among files and below folders, and group them by camera. Files below `out` are ignored.
@@ -96,7 +92,9 @@ def find_pictures(given: Sequence[Path], out: Path) -> BoardPictureFiles:
         except MeasurementError as error:
             unreadable[name] = str(error)
             continue
-        exif = _exif(path)
+        exif: Mapping[str, Any] = {}
+        with suppress(*DECODING_ERRORS, OSError):
+            exif = jpeg_colour_tags(path).exif
         groups[head.width_px, head.height_px, exif_number(exif.get("FocalLength"))].append(name)
         turns[name] = TURNS_BY_TAG.get(exif.get("Orientation", 1))
     if not groups:
@@ -127,14 +125,6 @@ def _files(given: Iterable[Path], out: Path) -> Iterator[Path]:
             for name in sorted(os.listdir(folder)):
                 if not name.startswith(".") and Path(name).suffix.lower() in SCAN_ENDINGS:
                     yield folder / name
-
-
-def _exif(path: Path) -> Mapping[str, Any]:
-    """Exif tags of an image; empty where there are none."""
-    try:
-        return jpeg_colour_tags(path).exif
-    except (*DECODING_ERRORS, OSError):
-        return {}
 
 
 def _names(cameras: Sequence[_Kind]) -> list[str]:

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+import numpy as np
+
 from pipeline.calibration.intrinsics import CameraIntrinsics, LensModel, LensSetting, free_lens
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures
 from pipeline.errors import InputError
@@ -239,7 +241,10 @@ def opencv_yaml(camera: CameraIntrinsics) -> str:
         lines.append('distortion_model: "fisheye"')
     lines += _opencv_matrix("std_deviations_fx_fy_cx_cy", 1, [camera.values[name].sigma for name in CENTRE])
     order = [*CENTRE, *(FISHEYE_ORDER if camera.is_fisheye else OPENCV_ORDER)[: len(distortion)]]
-    lines += _opencv_matrix(COVARIANCE, len(order), camera.covariance_matrix(order).ravel().tolist())
+    # Covariances of what was not estimated are 0.
+    rows = [list(camera.values).index(name) if name in camera.values else -1 for name in order]
+    covariance = np.pad(camera.covariance, (0, 1))[np.ix_(rows, rows)]
+    lines += _opencv_matrix(COVARIANCE, len(order), covariance.ravel().tolist())
     return "\n".join([*lines, f"avg_reprojection_error: {camera.rms_px:.10g}", ""])
 
 

@@ -1,16 +1,12 @@
 """Commands for adjustment: adjust, check, choose models, orient blocks, compare, plan, calibrate digital cameras."""
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from pipeline.commands import shared
 from pipeline.errors import InputError
-
-if TYPE_CHECKING:
-    from pipeline.calibration.calibrate_stage import Calibration
 
 OUT = Path("calibration")
 
@@ -173,12 +169,9 @@ def calibrate(
         workers=workers,
     )
     shared.show(as_json, found.as_json, found.print)
-    shared.print_next(as_json, *_steps(found))
-    return shared.LOOK if found.needs_review else shared.DONE
-
-
-def _steps(found: "Calibration") -> Iterator[str]:
-    yield shared.page_step(found.report)
+    steps = [shared.page_step(found.report)]
     if found.summary.verdict.problems:
-        yield shared.command_step("run", found.project, why="after the remedies above")
-    yield shared.command_step("export", found.project, "opencv", "DIR", why="or colmap, metashape, micmac, ...")
+        steps.append(shared.command_step("run", found.project, why="after the remedies above"))
+    steps.append(shared.command_step("export", found.project, "opencv", "DIR", why="or colmap, metashape, micmac, ..."))
+    shared.print_next(as_json, *steps)
+    return shared.LOOK if found.needs_review else shared.DONE

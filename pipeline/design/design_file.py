@@ -45,6 +45,15 @@ class Design:
         expected, plan = self.expected, self.expected.plan
         network, adjustment = expected.network, plan.adjustment
         kinds, pictures = network.observations.kind, list(self.files.values())[1:]
+        point_summary = {}
+        for axis, sigmas in zip("XYZ", expected.point_sigmas.T, strict=True):
+            estimated = sigmas[(sigmas > 0.0) & np.isfinite(sigmas)]
+            point_summary[axis] = {
+                "rms": rms(estimated),
+                "largest": float(estimated.max(initial=0.0)),
+                "estimated": len(estimated),
+                "undetermined": int(np.isinf(sigmas).sum()),
+            }
         return {
             "reseau": version("reseau"),
             "scene": str(self.scene),
@@ -68,7 +77,7 @@ class Design:
             "photographs_alone": {parameter.text: sigma for parameter, sigma in self.alone.items()},
             "images": {image.name: _image(expected, image) for image in network.images},
             "points": dict(_points(expected)),
-            "point_summary": dict(zip("XYZ", map(_axis_summary, expected.point_sigmas.T), strict=True)),
+            "point_summary": point_summary,
             "distances": [
                 {
                     "name": each.name,
@@ -140,17 +149,6 @@ def _points(expected: Expected) -> Iterator[tuple[str, Content]]:
     for point in expected.network.points:
         axes = {axis: _quantity(expected, Parameter.point(point.id, axis)) for axis in "XYZ"}
         yield point.id, {**axes, "images": observed.count(point.id)}
-
-
-def _axis_summary(sigmas: np.ndarray) -> Content:
-    """Summary of a coordinate's standard deviations where it is estimated, and how often it is not determined."""
-    estimated = sigmas[(sigmas > 0.0) & np.isfinite(sigmas)]
-    return {
-        "rms": rms(estimated),
-        "largest": float(estimated.max(initial=0.0)),
-        "estimated": len(estimated),
-        "undetermined": int(np.isinf(sigmas).sum()),
-    }
 
 
 def _reliability(expected: Expected) -> Content:

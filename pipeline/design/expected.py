@@ -19,7 +19,7 @@ from adjust.quality.reliability import OuterEffect
 from adjust.solution.adjustment import Options
 from adjust.solution.planning import Plan, plan
 from pipeline.adjusting.network import FEWEST_TARGETS
-from pipeline.design.setup import PlannedPoint, Setup, planned_network
+from pipeline.design.setup import Setup, planned_network
 from pipeline.types import Array
 from synthetic_images.scene import SceneImage
 
@@ -55,38 +55,11 @@ class GroupReliability:
     unchecked: int
 
 
-def group_reliability(plan: Plan) -> tuple[GroupReliability, ...]:
-    """Inner reliability (Baarda) of a plan for its sigma0 by groups; empty without redundancy."""
-    found, groups = plan.adjustment.reliability, defaultdict[str, list[tuple[float, float]]](list)
-    if found is None:
-        return ()
-    for unit, redundancy, smallest in zip(found.tested, found.redundancy, found.smallest, strict=True):
-        scale = plan.sigma0 * (UM_PER_MM if unit.group in IN_MM else 1.0)
-        pairs = zip(redundancy.tolist(), (scale * smallest).tolist(), strict=True)
-        groups[unit.group] += list(pairs)[: len(unit.coordinates)]
-    for each in plan.adjustment.further:
-        groups[each.group].append((each.redundancy, plan.sigma0 * each.detectable))
-    return tuple(_group(name, rows) for name, rows in groups.items())
-
-
 def error_unit(group: str) -> str:
     """Unit of a group's gross errors."""
     if group in IN_MM:
         return "um"
     return "object unit" if group in ("control", "distance") else "mixed"
-
-
-def _group(name: str, rows: list[tuple[float, float]]) -> GroupReliability:
-    redundancy, smallest = np.array(rows).T
-    checked = smallest[np.isfinite(smallest)]
-    return GroupReliability(
-        name,
-        len(rows),
-        float(redundancy.mean()),
-        float(np.median(checked)) if len(checked) else np.inf,
-        float(checked.max(initial=0.0)) if len(checked) else np.inf,
-        len(rows) - len(checked),
-    )
 
 
 @dataclass(frozen=True)
@@ -166,7 +139,26 @@ class Expected:
 
     @cached_property
     def groups(self) -> tuple[GroupReliability, ...]:
-        return group_reliability(self.plan)
+        """Inner reliability (Baarda) of the plan for its sigma0 by groups; empty without redundancy."""
+        plan, found = self.plan, self.plan.adjustment.reliability
+        if found is None:
+            return ()
+        rows_of = defaultdict[str, list[tuple[float, float]]](list)
+        for unit, redundancies, errors in zip(found.tested, found.redundancy, found.smallest, strict=True):
+            scale = plan.sigma0 * (UM_PER_MM if unit.group in IN_MM else 1.0)
+            pairs = zip(redundancies.tolist(), (scale * errors).tolist(), strict=True)
+            rows_of[unit.group] += list(pairs)[: len(unit.coordinates)]
+        for each in plan.adjustment.further:
+            rows_of[each.group].append((each.redundancy, plan.sigma0 * each.detectable))
+        groups = []
+        for name, rows in rows_of.items():
+            redundancy, smallest = np.array(rows).T
+            checked = smallest[np.isfinite(smallest)]
+            median = float(np.median(checked)) if len(checked) else np.inf
+            largest = float(checked.max()) if len(checked) else np.inf
+            mean = float(redundancy.mean())
+            groups.append(GroupReliability(name, len(rows), mean, median, largest, len(rows) - len(checked)))
+        return tuple(groups)
 
     @property
     def outer_effects(self) -> Sequence[OuterEffect]:
@@ -228,7 +220,11 @@ def alone(expected: Expected) -> Mapping[Parameter, float]:
     """
     network = expected.network
     camera = network.cameras[0]
-    without = replace(network, cameras=(_freed_camera(camera),))
+    # All parameters are free that are not fixed.
+    fiducials = {id: Fiducial(_freed(mark.x_mm), _freed(mark.y_mm)) for id, mark in camera.fiducials.items()}
+    c, x0, y0 = (prior and _freed(prior) for prior in (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm))
+    freed = replace(camera, principal_distance_mm=c, x0_mm=x0, y0_mm=y0, fiducials=fiducials)
+    without = replace(network, cameras=(freed,))
     options = Options(expected.setup.settings.datum)
     free = plan(without, planned_network(expected.setup)[1], options, expected.plan.sigma0)
     interior = [Parameter.interior(camera.name, name) for name in (*INTERIOR, *expected.family_parameters)]
@@ -241,14 +237,6 @@ def alone(expected: Expected) -> Mapping[Parameter, float]:
 
 def _fiducial_unknowns(camera: Camera) -> list[Parameter]:
     return [Parameter.fiducial(camera.name, id, axis) for id in camera.fiducials for axis in "xy"]
-
-
-def _freed_camera(camera: Camera) -> Camera:
-    """The camera with all parameters free that are not fixed."""
-    fiducials = {id: Fiducial(_freed(mark.x_mm), _freed(mark.y_mm)) for id, mark in camera.fiducials.items()}
-    interior = (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm)
-    c, x0, y0 = (prior and _freed(prior) for prior in interior)
-    return replace(camera, principal_distance_mm=c, x0_mm=x0, y0_mm=y0, fiducials=fiducials)
 
 
 def _freed(prior: Prior) -> Prior:
@@ -312,11 +300,22 @@ def _photos(setup: Setup) -> Iterator[Iterable[Change]]:
         omega, phi, kappa = (math.radians(angle) for angle in photo.angles_deg)
         image = SceneImage(photo.name, (*photo.position, omega, phi, kappa))
         yield [(f"one more photo: {photo.name}", _add_image(setup, image))]
-    center, axis = _field_axis(setup.points)
     yield _more(setup, "turned by 90 degrees", _rolled)
+    center = np.mean([point.xyz for point in setup.points], axis=0)
+    axis = np.mean([point.normal for point in setup.points], axis=0)  # in which the targets face
+    length = float(np.linalg.norm(axis))
+    axis = axis / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
+
+    def carried(exterior: Exterior, rotation: Array) -> Exterior:
+        """Rotate the station around the centre, together with the camera."""
+        station = center + rotation @ (np.array(exterior[:3]) - center)
+        angles = angles_from_rotation(rotation_from_angles(np.array(exterior[3:])) @ rotation.T)
+        x, y, z, omega, phi, kappa = (float(value) for value in (*station, *angles))
+        return (x, y, z, omega, phi, kappa)
+
     for turn, words in ((QUARTER, "a quarter"), (2 * QUARTER, "half")):
-        rotation = rotation_from_vector(turn * axis)
-        yield _more(setup, f"carried {words} round the field", partial(_carried, center=center, rotation=rotation))
+        moved = partial(carried, rotation=rotation_from_vector(turn * axis))
+        yield _more(setup, f"carried {words} round the field", moved)
 
 
 def _more(setup: Setup, words: str, moved: Callable[[Exterior], Exterior]) -> Iterator[Change]:
@@ -363,20 +362,3 @@ def _add_image(setup: Setup, image: SceneImage) -> Setup:
 
 def _rolled(exterior: Exterior) -> Exterior:
     return (*exterior[:5], exterior[5] + QUARTER)
-
-
-def _field_axis(points: Iterable[PlannedPoint]) -> tuple[Array, Array]:
-    """Centre of the field, and mean direction in which its targets face."""
-    listed = list(points)
-    center = np.mean([point.xyz for point in listed], axis=0)
-    axis = np.mean([point.normal for point in listed], axis=0)
-    length = float(np.linalg.norm(axis))
-    return center, axis / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
-
-
-def _carried(exterior: Exterior, center: Array, rotation: Array) -> Exterior:
-    """Rotate the station around the centre, together with the camera."""
-    station = center + rotation @ (np.array(exterior[:3]) - center)
-    angles = angles_from_rotation(rotation_from_angles(np.array(exterior[3:])) @ rotation.T)
-    x, y, z, omega, phi, kappa = (float(value) for value in (*station, *angles))
-    return (x, y, z, omega, phi, kappa)

@@ -11,7 +11,6 @@ from adjust.functional_model.lens import Prior
 from adjust.functional_model.scanner import smooth_terms
 from adjust.functional_model.transformation import fit_transformation
 from adjust.problem import network
-from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Network, Transformation
 from adjust.problem.observations import Distance, ObservationKind, Observations
 from pipeline.adjusting.network import FEWEST_TARGETS
@@ -147,15 +146,22 @@ def planned_network(setup: Setup) -> tuple[Network, Approximations]:
                 "the field, or leave it out."
             )
     rays = Counter(i for rows in visible.values() for i in rows)
-    given = [min(point.sigma_planimetry, point.sigma_height) < math.inf for point in setup.points]
-    used = [i for i in sorted(rays) if rays[i] >= 2 or given[i]]
-    camera = _camera(setup)
+    is_given = [min(point.sigma_planimetry, point.sigma_height) < math.inf for point in setup.points]
+    used = [i for i in sorted(rays) if rays[i] >= 2 or is_given[i]]
+    given_point = setup.camera.principal_point_mm or (0.0, 0.0)
+    # Fiducials only where the film transformation is estimated from them.
+    fiducials = setup.camera.fiducials if setup.transformation != "none" else ()
+    camera = replace(setup.camera, principal_point_mm=given_point, fiducials=fiducials).camera()
     observations = _observations(setup, visible, set(used))
     points = [setup.points[i] for i in used]
+    sigmas = [(point.sigma_planimetry, point.sigma_planimetry, point.sigma_height) for point in points]
     planned = Network(
         cameras=(camera,),
         images=tuple(_image(setup, camera.name, image) for image in setup.images),
-        points=tuple(_object_point(point) for point in points),
+        points=tuple(
+            network.ObjectPoint(point.id, *map(Prior, map(float, point.xyz), sigma))
+            for point, sigma in zip(points, sigmas, strict=True)
+        ),
         observations=observations,
         distances=_distances(setup, {point.id: point.xyz for point in points}),
         scanners=_scanners(setup),
@@ -193,18 +199,6 @@ def _scanners(setup: Setup) -> tuple[network.Scanner, ...]:
     return (network.Scanner(DEFAULT_SCANNER, dict.fromkeys(names, prior), half_mm=(half_mm, half_mm)),)
 
 
-def _camera(setup: Setup) -> Camera:
-    """The camera with its priors; fiducials only where the film transformation is estimated from them."""
-    point = setup.camera.principal_point_mm or (0.0, 0.0)
-    fiducials = setup.camera.fiducials if setup.transformation != "none" else ()
-    return replace(setup.camera, principal_point_mm=point, fiducials=fiducials).camera()
-
-
-def _object_point(point: PlannedPoint) -> network.ObjectPoint:
-    sigmas = (point.sigma_planimetry, point.sigma_planimetry, point.sigma_height)
-    return network.ObjectPoint(point.id, *map(Prior, map(float, point.xyz), sigmas))
-
-
 def _observations(setup: Setup, visible: dict[str, list[int]], used: set[int]) -> Observations:
     """One row per visible mark; the coordinates are computed when the network is planned."""
     film_um = setup.settings.film_sigma_um
@@ -224,10 +218,14 @@ def _observations(setup: Setup, visible: dict[str, list[int]], used: set[int]) -
 def _values(setup: Setup, planned: Network, points: list[PlannedPoint]) -> Approximations:
     camera = planned.cameras[0]
     marks = np.array([one.xy_mm for one in setup.camera.fiducials]).reshape(-1, 2)
-    films = {
-        image.name: fit_transformation(setup.transformation, marks @ _laid(setup, image).T, marks)
-        for image in setup.images
-    }
+    films = {}
+    for image in setup.images:
+        comparator_from_camera = np.eye(2)  # rotation, with reflection if the scan is mirrored
+        if setup.bends:
+            pose_rad = math.radians(int(image.pose.rstrip("m")))
+            mirror = np.diag([-1.0 if image.pose.endswith("m") else 1.0, 1.0])
+            comparator_from_camera = turn(image.turn_rad + pose_rad) @ mirror
+        films[image.name] = fit_transformation(setup.transformation, marks @ comparator_from_camera.T, marks)
     point = setup.lens.principal_point_mm
     return Approximations(
         interior={camera.name: np.array([setup.lens.principal_distance_mm, *point])},
@@ -236,11 +234,3 @@ def _values(setup: Setup, planned: Network, points: list[PlannedPoint]) -> Appro
         points={point.id: point.xyz for point in points},
         mirrored=frozenset(name for name, (_, mirrored) in films.items() if mirrored),
     )
-
-
-def _laid(setup: Setup, image: SceneImage) -> Array:
-    """(2, 2) rotation, or rotation with reflection, from the camera frame to the comparator."""
-    if not setup.bends:
-        return np.eye(2)
-    pose_rad = math.radians(int(image.pose.rstrip("m")))
-    return turn(image.turn_rad + pose_rad) @ np.diag([-1.0 if image.pose.endswith("m") else 1.0, 1.0])

@@ -72,7 +72,10 @@ class Variations:
         values = copy.deepcopy(self.values)
         parts = quantity.split(".")
         if parts[0] == "camera" and isinstance(values.get("camera"), str):
-            values["camera"] = _camera_values(self.path.parent / values["camera"])
+            camera = copy.deepcopy(dict(read_toml(self.path.parent / values["camera"]).values))
+            for table in (camera, *camera.get("fiducial", [])):
+                table.pop("mark", None)  # the drawings of the marks are not needed here
+            values["camera"] = camera
         if parts[0] == "exterior":
             if (element := parts[-1]) not in EXTERIOR:
                 hint = did_you_mean(element, EXTERIOR)
@@ -91,15 +94,6 @@ class Variations:
         else:
             _assign(values, parts, value)
         return values
-
-
-def _camera_values(path: Path) -> Values:
-    """Values of a camera file without the drawings of its marks, which are not needed here."""
-    values = copy.deepcopy(dict(read_toml(path).values))
-    values.pop("mark", None)
-    for fiducial in values.get("fiducial", []):
-        fiducial.pop("mark", None)
-    return values
 
 
 def _count(quantity: str, value: float | str) -> int:

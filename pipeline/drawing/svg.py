@@ -29,7 +29,10 @@ def write_picture(path: Path, width: float, height: float, title: str, *content:
 
 def tag(name: str, *content: str, **attributes: object) -> Markup:
     """SVG element; underscores in attribute names become hyphens, a trailing one (class_) is removed."""
-    pairs = "".join(f' {key.rstrip("_").replace("_", "-")}="{escape(_text(v))}"' for key, v in attributes.items())
+    pairs = ""
+    for key, value in attributes.items():
+        text = f"{value:.2f}" if isinstance(value, float) else str(value)
+        pairs += f' {key.rstrip("_").replace("_", "-")}="{escape(text)}"'
     inside = "".join(str(escape(item)) for item in content)
     return Markup(f"<{name}{pairs}>{inside}</{name}>")
 
@@ -191,7 +194,3 @@ def round_step(size: float) -> float:
 
 def _tick_text(value: float) -> str:
     return f"{value:.6g}".replace("-", "−")
-
-
-def _text(value: object) -> str:
-    return f"{value:.2f}" if isinstance(value, float) else str(value)

@@ -110,14 +110,18 @@ def drawn_alike(layouts: Mapping[tuple[str, ...], FiducialLayout]) -> dict[str, 
     """For each camera with solid marks only: the other cameras whose marks at nearly the same places look similar."""
     solid = {names: layout for names, layout in layouts.items() if all(is_solid(mark) for mark in layout.marks)}
     pictures = {names: [_picture(mark) for mark in layout.marks] for names, layout in solid.items()}
+    rim = round(_OFF_MM * _PX_PER_MM)  # of the offsets at which drawings are compared
 
     def alike(names: tuple[str, ...], other: tuple[str, ...]) -> bool:
         places = np.array([mark.xy_mm for mark in solid[other].marks])
-        found = []
-        for mark, picture in zip(solid[names].marks, pictures[names], strict=True):
+        likeness = np.zeros(len(pictures[names]))
+        for row, (mark, picture) in enumerate(zip(solid[names].marks, pictures[names], strict=True)):
             off_mm = np.hypot(*(places - mark.xy_mm).T)
-            found.append(_likeness(picture, pictures[other][int(off_mm.argmin())]) if off_mm.min() < _NEAR_MM else 0.0)
-        return float(np.mean(found)) >= _ALIKE
+            if off_mm.min() < _NEAR_MM:
+                window = picture[rim:-rim, rim:-rim]
+                ncc = cv2.matchTemplate(pictures[other][int(off_mm.argmin())], window, cv2.TM_CCOEFF_NORMED)
+                likeness[row] = ncc.max()
+        return float(likeness.mean()) >= _ALIKE
 
     others = {names: [other[0] for other in solid if other != names and alike(names, other)] for names in solid}
     return {name: tuple(own) for names, own in others.items() if own for name in names}
@@ -134,12 +138,6 @@ def _picture(mark: LayoutMark) -> cv2.typing.MatLike:
     matrix = np.array([[_PX_PER_MM, 0.0, half_px], [0.0, -_PX_PER_MM, half_px]])
     size = 2 * half_px + 1
     return np.nan_to_num(known_picture(mark.mark, matrix, size, size, _BLUR_PX)).astype(np.float32)
-
-
-def _likeness(first: cv2.typing.MatLike, second: cv2.typing.MatLike) -> float:
-    """Largest NCC of two drawings within an offset of _OFF_MM."""
-    rim = round(_OFF_MM * _PX_PER_MM)
-    return float(cv2.matchTemplate(second, first[rim:-rim, rim:-rim], cv2.TM_CCOEFF_NORMED).max())
 
 
 @dataclass(frozen=True)
@@ -174,12 +172,6 @@ class Trial:
     seconds: float
     expected: float
     pixel_um: float | None = None
-
-    @property
-    def against_chance(self) -> str:
-        if self.chance is None:
-            return f"{self.expected:.1g} false alarms expected in such a scan"
-        return f"the same marks in wrong places score {self.chance:.2f}"
 
     @property
     def stands_out(self) -> bool:
@@ -224,9 +216,12 @@ class Identification:
                 "faint; --pitch helps where the scan's file does not say it."
             )
         first = self.best[0]
+        by_chance = f"{first.expected:.1g} false alarms expected in such a scan"
+        if first.chance is not None:
+            by_chance = f"the same marks in wrong places score {first.chance:.2f}"
         text = (
             f"{self.scan.name}: {' or '.join(first.cameras)}, score {first.score:.2f}: {first.found} of {first.drawn} "
-            f"marks, likeness {first.likeness:.2f}, signal-to-noise {first.snr:.1f}; {first.against_chance}."
+            f"marks, likeness {first.likeness:.2f}, signal-to-noise {first.snr:.1f}; {by_chance}."
         )
         if len(self.best) > 1:
             text += f" {' or '.join(self.best[1].cameras)} comes close with {self.best[1].score:.2f}."
@@ -234,8 +229,13 @@ class Identification:
             text += " Their marks are alike; the data strip or the focal length must decide."
         named = [name for name in self.best_names() if name in self.unreported]
         text += "".join(f" {name} rests on no calibration report: {self.unreported[name]}." for name in named)
+        if others := " or ".join(self.much_alike()):
+            text += (
+                f" That rests on the form of its marks alone, and {others} has marks much like them: compare the "
+                "drawings."
+            )
         against = self.against_pitch()
-        return text + self._form_remark() + self._plate_remark() + (f" {against}" if against else "")
+        return text + self._plate_remark() + (f" {against}" if against else "")
 
     def best_names(self) -> tuple[str, ...]:
         """Names of the cameras of the best trials."""
@@ -250,15 +250,6 @@ class Identification:
         best = self.best_names()
         others = (other for name in best for other in self.alike.get(name, ()) if other not in best)
         return tuple(dict.fromkeys(others))
-
-    def _form_remark(self) -> str:
-        """A warning if the identification rests only on the shape of marks and other cameras have similar ones."""
-        others = " or ".join(self.much_alike())
-        if not others:
-            return ""
-        return (
-            f" That rests on the form of its marks alone, and {others} has marks much like them: compare the drawings."
-        )
 
     def _plate_remark(self) -> str:
         """Which of the best cameras agree with the plate."""
@@ -295,20 +286,19 @@ def print_identification(identification: Identification, console: Console) -> No
     """Print the trials that found marks, the number of the others, and the conclusion."""
     tried = [trial for trial in identification.trials if trial.found]
     for trial in tried:
+        words = [
+            f"{trial.score:.2f}: {trial.found} of {trial.drawn} marks, likeness {trial.likeness:.2f}",
+            f"signal-to-noise {trial.snr:.1f}",
+        ]
+        if trial.residual_mm is not None:
+            words.append(f"affine residual {trial.residual_mm:.3f} mm ({trial.residual_sigmas:.0f} sigma)")
+        if math.isfinite(trial.expected):
+            words.append(f"expected false alarms {trial.expected:.1g}")
+        if trial.chance is not None:
+            words.append(f"in wrong places {trial.chance:.2f}")
+        figures = f"{', '.join(words)}; {trial.seconds:.0f} s"
         console.print(", ".join(trial.cameras), style="bold", highlight=False)
-        console.print(Padding(_figures(trial), (0, 0, 0, 4)), highlight=False)
+        console.print(Padding(figures, (0, 0, 0, 4)), highlight=False)
     if rest := identification.trials[len(tried) :]:
         console.print(f"{counted(len(rest), 'other layout')} of marks: not found (--json has the reasons).")
     console.print(identification.sentence(), highlight=False, soft_wrap=True)
-
-
-def _figures(trial: Trial) -> str:
-    words = [f"{trial.score:.2f}: {trial.found} of {trial.drawn} marks, likeness {trial.likeness:.2f}"]
-    words.append(f"signal-to-noise {trial.snr:.1f}")
-    if trial.residual_mm is not None:
-        words.append(f"affine residual {trial.residual_mm:.3f} mm ({trial.residual_sigmas:.0f} sigma)")
-    if math.isfinite(trial.expected):
-        words.append(f"expected false alarms {trial.expected:.1g}")
-    if trial.chance is not None:
-        words.append(f"in wrong places {trial.chance:.2f}")
-    return f"{', '.join(words)}; {trial.seconds:.0f} s"

@@ -88,28 +88,21 @@ class LayoutSearch:
         )
         self._known: list[Tried] = []
 
-    def try_pitch(self, layout: FiducialLayout, pitch_um: tuple[float, float]) -> Tried:
-        """Search at the scan's pitch."""
-        return self._as_given(layout, pitch_um, lambda given: [given], 0)
-
-    def longer_one_way(self, layout: FiducialLayout, pitch_um: tuple[float, float]) -> Tried:
-        """Search with non-square pixels, beyond the affinity that a search at the scan's pitch allows."""
-        return self._as_given(layout, pitch_um, lambda given: [longer(given, each) for each in _STRETCHES], 1)
-
-    def _as_given(
-        self,
-        layout: FiducialLayout,
-        pitch_um: tuple[float, float],
-        hypotheses: Callable[[PitchHypothesis], Hypotheses],
-        before: int,
+    def try_pitch(
+        self, layout: FiducialLayout, pitch_um: tuple[float, float], stretches: Sequence[float] = ()
     ) -> Tried:
-        """Search under hypotheses derived from a given pitch."""
+        """Search at the scan's pitch.
+
+        stretches: of pixels that are not square, beyond the affinity that this search allows; then only these are
+        tried.
+        """
         bold = _boldest(layout)
         picture = self._solid if all(is_solid(mark) for mark in bold.marks) else self._fine
         times = self._scan.width_px / picture.width_px
         options = FiducialOptions(pitch_is_right=True)
         ((given,), *_) = pitch_hypotheses(picture, bold, (times * pitch_um[0], times * pitch_um[1]), options)
-        return self._tried(_some(layout), bold, picture, hypotheses(given), before)
+        hypotheses = [longer(given, each) for each in stretches] or [given]
+        return self._tried(_some(layout), bold, picture, hypotheses, before=1 if stretches else 0)
 
     def try_any_pitch(self, layout: FiducialLayout) -> Tried:
         """Search without a pitch: the frame is assumed to fill the scan, and the pixels to be square."""
@@ -194,12 +187,18 @@ def identify(
     ------
     MeasurementError : the scan cannot be read.
     """
-    picture, times, its_pitch_um = _picture(path, max_pixels)
+    with open_scan(path, max_pixels) as whole:
+        picture = thumbnail(whole, _PICTURE_PX)
+        times, its_pitch_um = whole.width_px / picture.width_px, whole.pitch_um
     given, search = its_pitch_um if pitch_um is None else (pitch_um, pitch_um), LayoutSearch(picture)
     layouts = {names: _limit_drawings(cameras[names[0]].layout()) for names in _alike(cameras)}
     pitch = None if given is None else (times * given[0], times * given[1])
     with reporter.stage("trying layout") as count:
-        trials, tries = _first_that_stand_out(search, layouts, _layouts_like(layouts, likely), pitch, count)
+        trials, tries = list[Trial](), dict[Names, Tried]()
+        for tries, most in _attempts(search, layouts, _layouts_like(layouts, likely), pitch, count):
+            trials = _trials(search, tries, count)
+            if any(trial.stands_out and trial.expected <= most for trial in trials):
+                break
     alike = _alike_in_scan(search, trials, tries, drawn_alike(layouts))
     del search, tries  # frees the correlation images
     sources = {name: camera.source for name, camera in cameras.items()}
@@ -232,13 +231,6 @@ def _figure(layout: FiducialLayout) -> Array:
     return np.asarray(places / np.sqrt((places**2).sum(axis=1).mean()))
 
 
-def _picture(path: Path, max_pixels: int | None) -> tuple[Scan, float, tuple[float, float] | None]:
-    """The reduced scan, its reduction factor and the scan's pitch in µm. The scan itself is closed."""
-    with open_scan(path, max_pixels) as whole:
-        picture = thumbnail(whole, _PICTURE_PX)
-        return picture, whole.width_px / picture.width_px, whole.pitch_um
-
-
 def _limit_drawings(layout: FiducialLayout) -> FiducialLayout:
     """Limit the drawings of marks within the frame (wings) to the frame."""
     # Of marks beyond its edge little more than a corner would remain, which correlates with many structures.
@@ -267,22 +259,6 @@ def _alike_in_scan(
     return found
 
 
-def _first_that_stand_out(
-    search: LayoutSearch,
-    layouts: Mapping[Names, FiducialLayout],
-    likely: Mapping[Names, FiducialLayout],
-    pitch_um: tuple[float, float] | None,
-    count: Count,
-) -> tuple[list[Trial], Mapping[Names, Tried]]:
-    """Trials of the first attempt in which a layout stands out, else of the last one."""
-    trials, tries = list[Trial](), dict[Names, Tried]()
-    for tries, most in _attempts(search, layouts, likely, pitch_um, count):
-        trials = _trials(search, tries, count)
-        if any(trial.stands_out and trial.expected <= most for trial in trials):
-            break
-    return trials, tries
-
-
 def _attempts(
     search: LayoutSearch,
     layouts: Mapping[Names, FiducialLayout],
@@ -299,8 +275,9 @@ def _attempts(
             given = _each(some, partial(search.try_pitch, pitch_um=pitch_um), count)
             if any(each.answer.expected <= MAX_FALSE_CAMERAS for each in given.values()):
                 yield given, most
-        longer = _each(layouts, partial(search.longer_one_way, pitch_um=pitch_um), count)
-        pairs = {names: (each, longer[names]) for names, each in given.items()}
+        by_stretch = partial(search.try_pitch, pitch_um=pitch_um, stretches=_STRETCHES)
+        stretched = _each(layouts, by_stretch, count)
+        pairs = {names: (each, stretched[names]) for names, each in given.items()}
         yield {names: min(pair, key=lambda each: each.answer.expected) for names, pair in pairs.items()}, np.inf
     yield _any_pitch_tries(search, layouts, count), np.inf
 
@@ -332,26 +309,22 @@ def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) ->
     ranked = sorted(tries, key=keys.__getitem__)
     for done, names in enumerate(ranked, len(ranked)):
         each, standing = tries[names], [trial for trial in trials if trial.stands_out]
-        limits = [_expected_at_most(trial, len(each.layout.marks)) for trial in standing]
-        if each.answer.expected > min([*limits, _HOPELESS]):
-            expected = each.answer.expected
+        drawn, expected = len(each.layout.marks), each.answer.expected
+        limit = _HOPELESS
+        for trial in standing:
+            most = MAX_FALSE_CAMERAS if trial.expected <= MAX_FALSE_CAMERAS else _BY_CHANCE
+            # Fewer marks may be a part of those found: nine crosses of a larger réseau match a layout of nine.
+            limit = min(limit, most, _ODDS * trial.expected if trial.found > drawn else most)
+        if expected > limit:
             why = "no constellation of its marks correlates anywhere in the scan"
             if np.isfinite(expected):
                 why = f"{expected:.1g} false alarms expected in such a scan"
-            drawn = len(each.layout.marks)
             none = Trial(names, 0, drawn, 0.0, 0.0, 0.0, None, None, None, f"not measured: {why}", 0.0, expected)
             trials.append(none)
         else:
             count(", ".join(names), done, len(ranked))
             trials.append(_trial(search, names, each, CLOSE * max((trial.score for trial in standing), default=0.0)))
     return trials
-
-
-def _expected_at_most(seen: Trial, marks: int) -> float:
-    """Limit on the expected false alarms of a layout with so many marks, given a trial that stands out."""
-    # Fewer marks may be a part of those found: nine crosses of a larger réseau match a layout of nine.
-    most = MAX_FALSE_CAMERAS if seen.expected <= MAX_FALSE_CAMERAS else _BY_CHANCE
-    return min(most, _ODDS * seen.expected) if seen.found > marks else most
 
 
 def _alike(cameras: Mapping[str, CameraFile]) -> list[Names]:
@@ -375,7 +348,12 @@ def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Tri
         frame, reason = None, f"too coarse: the finest detail of its marks would be {width_px:.2f} px wide there"
     fits = [fit for fit in frame.fits if fit] if frame else []
     residual = _residual(frame, each.layout) if frame else None
-    score = likeness(frame) if frame else 0.0
+    score, chance = likeness(frame) if frame else 0.0, None
+    if score > close and expected > MAX_FALSE_CAMERAS:
+        chance, wrong = 0.0, search.stretched(each)
+        # Where the stretched layout correlates much less, the marks themselves must be present.
+        if wrong.answer.expected <= _ODDS * expected and (elsewhere := search.recognise(wrong)):
+            chance = likeness(elsewhere)
     return Trial(
         cameras=names,
         found=len(fits),
@@ -383,7 +361,7 @@ def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Tri
         likeness=float(np.mean([fit.likeness for fit in fits])) if fits else 0.0,
         snr=float(np.median([fit.snr for fit in fits])) if fits else 0.0,
         score=score,
-        chance=_score_by_chance(search, each) if score > close and expected > MAX_FALSE_CAMERAS else None,
+        chance=chance,
         residual_sigmas=None if residual is None else residual[0],
         residual_mm=None if residual is None else residual[1],
         reason="" if frame else reason,
@@ -391,15 +369,6 @@ def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Tri
         expected=expected,
         pixel_um=1000 / linear_scale(frame.pixel_from_camera) if frame else None,
     )
-
-
-def _score_by_chance(search: LayoutSearch, each: Tried) -> float:
-    """Score of the stretched layout; 0 where it correlates so much less that the marks themselves must be present."""
-    wrong = search.stretched(each)
-    if wrong.answer.expected > _ODDS * each.answer.expected:
-        return 0.0
-    frame = search.recognise(wrong)
-    return likeness(frame) if frame else 0.0
 
 
 def _residual(frame: Frame, layout: FiducialLayout) -> tuple[float, float] | None:

@@ -147,7 +147,14 @@ def measure_sheet(scan: Scan, sheet: CodedPoints) -> tuple[tuple[MarkMeasurement
     if misread:
         notes = (*notes, f"Rings that read as {listed(misread)} lie where the sheet has another point, or none.")
     options = TargetOptions("light" if _sign(found, coded) > 0.0 else "dark")
-    predictions = _predictions(sheet, found, naming)
+    predictions = []  # of an identified point at its dot, of another one at its place by the fit of the sheet
+    for index, id in enumerate(sheet.ids):
+        place, shape = naming.places_px[index], naming.pixel_from_disk[index]
+        if index in naming.named:
+            dot = found[naming.named[index]]
+            predictions.append(TargetPrediction(id, dot.center_px, dot.pixel_from_disk, _FOUND_WITHIN_PX))
+        elif np.all(np.isfinite(place)) and np.all(np.isfinite(shape)):
+            predictions.append(TargetPrediction(id, place, shape, naming.gate_px))
     unseen = absent_targets(sheet.ids, "the sheet's place in the picture does not show it", Code.OUTSIDE)
     marks = {mark.point: mark for mark in (*unseen, *measure_disks(scan, predictions, options))}
     return tuple(marks.values()), notes
@@ -156,19 +163,6 @@ def measure_sheet(scan: Scan, sheet: CodedPoints) -> tuple[tuple[MarkMeasurement
 def _sign(found: Sequence[Candidate], coded: dict[int, int]) -> float:
     """1 for light coded dots, -1 for dark ones."""
     return float(np.sign(np.sum([np.sign(found[dot].contrast_dn) for dot in coded]))) or 1.0
-
-
-def _predictions(sheet: CodedPoints, found: Sequence[Candidate], naming: Naming) -> list[TargetPrediction]:
-    """Predict each identified point at its dot, and each other point at its place by the fit of the sheet."""
-    predictions = []
-    for index, id in enumerate(sheet.ids):
-        place, shape = naming.places_px[index], naming.pixel_from_disk[index]
-        if index in naming.named:
-            dot = found[naming.named[index]]
-            predictions.append(TargetPrediction(id, dot.center_px, dot.pixel_from_disk, _FOUND_WITHIN_PX))
-        elif np.all(np.isfinite(place)) and np.all(np.isfinite(shape)):
-            predictions.append(TargetPrediction(id, place, shape, naming.gate_px))
-    return predictions
 
 
 def measure_coded_field(

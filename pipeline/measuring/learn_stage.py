@@ -47,7 +47,14 @@ def learn_marks(
     Returns the project with templates for the marks. Raises InputError or MeasurementError where the marks cannot be
     learned.
     """
-    files = _file_names([camera.path for camera in project.cameras.values()], _learned_folder(project))
+    # A camera's file in out/learned has the name of the camera file, with a number where it is taken.
+    paths = dict.fromkeys(camera.path for camera in project.cameras.values())
+    stems, files = {path.stem for path in paths}, dict[Path, str]()
+    for path in paths:
+        taken = set(files.values())
+        numbered = (f"{path.stem}-{number}" for number in count(2))
+        is_there = path.stem in taken or path.parent.resolve() == _learned_folder(project).resolve()
+        files[path] = next(name for name in numbered if name not in taken | stems) if is_there else path.stem
     known = add_learned_marks(project, memory)
     cameras = dict(known.cameras)
     for name, camera in known.cameras.items():
@@ -60,13 +67,18 @@ def learn_marks(
 
 
 def add_learned_marks(project: Project, memory: Memory) -> Project:
-    """Add the marks that were learned earlier; the marks of other cameras remain to be learned."""
-    cameras = {
-        name: (_stored_earlier(project, camera, memory.recall(_key(project, camera))) or camera)
-        if camera.learned
-        else _check_learned_scan(project, camera)
-        for name, camera in project.cameras.items()
-    }
+    """Add the marks that were learned earlier, if their files are unchanged; the marks of other cameras remain to be
+    learned."""
+    cameras = dict(project.cameras)
+    for name, camera in project.cameras.items():
+        if camera.learned:
+            kept = memory.recall(_key(project, camera))
+            path = _learned_folder(project) / (kept or {}).get("file", "")
+            if kept is None or not path.is_file() or hash_file(path) != kept["sha256"]:
+                continue
+            learned = read_camera(path)
+            camera = replace(camera, fiducials=learned.fiducials, learned_from=learned.learned_from)
+        cameras[name] = _check_learned_scan(project, camera)
     return replace(project, cameras=cameras)
 
 
@@ -76,29 +88,8 @@ def _key(project: Project, camera: CameraFile) -> str:
     return f"learned {fingerprint([camera.fiducials, camera.frame_mm, camera.clicks, settings])}"
 
 
-def _stored_earlier(project: Project, camera: CameraFile, kept: Mapping[str, str] | None) -> CameraFile | None:
-    """The camera with marks that were learned earlier, if their files are unchanged; else None."""
-    path = _learned_folder(project) / (kept or {}).get("file", "")
-    if kept is None or not path.is_file() or hash_file(path) != kept["sha256"]:
-        return None
-    learned = read_camera(path)
-    return _check_learned_scan(project, replace(camera, fiducials=learned.fiducials, learned_from=learned.learned_from))
-
-
 def _learned_folder(project: Project) -> Path:
     return project.output / "learned"
-
-
-def _file_names(cameras: Sequence[Path], learned: Path) -> Mapping[Path, str]:
-    """Names of the files of each camera in out/learned: that of the camera file, with a number where it is taken."""
-    names: dict[Path, str] = {}
-    stems = {path.stem for path in cameras}
-    for path in dict.fromkeys(cameras):
-        taken = set(names.values())
-        numbered = (f"{path.stem}-{number}" for number in count(2))
-        is_there = path.stem in taken or path.parent.resolve() == learned.resolve()
-        names[path] = next(name for name in numbered if name not in taken | stems) if is_there else path.stem
-    return names
 
 
 def _check_learned_scan(project: Project, camera: CameraFile) -> CameraFile:
@@ -152,7 +143,15 @@ def _chips(
 ) -> tuple[Mapping[str, list[Chip]], set[str]]:
     """Image patches of every learned mark, by fiducial; and the scan orientations that some frame leaves open."""
     frames = {scan.frame.image: scan.frame for scan in measure(tasks)}
-    named = [(task, frames[task.name]) for task in tasks if _is_named(frames[task.name], start)]
+    # Only of frames whose marks have certain names, up to their own symmetry, or the clicked orientation.
+    alike = next((one.mark.alike for one in start.fiducials if isinstance(one.mark, MarkTemplate)), ())
+    named = [
+        (task, frame)
+        for task in tasks
+        if (frame := frames[task.name]).pose is not None and frame.pixel_from_camera is not None
+        if start.learned_from is not None
+        if frame.pose.is_unambiguous_up_to(alike) or frame.pose.name == start.learned_from.pose
+    ]
     chips = defaultdict[str, list[Chip]](list)
     for of_scan in map_items(workers, partial(_learned_chips, learned), named):
         for id, chip in of_scan.items():
@@ -172,15 +171,6 @@ def _learned_chips(learned: Sequence[GivenFiducial], named: tuple[ScanTask, Fram
             for one in learned
             if (center := found.get(one.id)) is not None
         }
-
-
-def _is_named(frame: FrameMeasurement, start: CameraFile) -> bool:
-    """Whether the marks found have certain names, up to their own symmetry, or the clicked orientation."""
-    pose, learned = frame.pose, start.learned_from
-    if pose is None or learned is None or frame.pixel_from_camera is None:
-        return False
-    alike = next((one.mark.alike for one in start.fiducials if isinstance(one.mark, MarkTemplate)), ())
-    return pose.is_unambiguous_up_to(alike) or pose.name == learned.pose
 
 
 def _averaged(

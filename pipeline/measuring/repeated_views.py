@@ -55,8 +55,9 @@ def check_repeated_views(scans: Sequence[MeasuredScan], is_board: bool, picture:
     def show_the_same(first: int, second: int) -> bool:
         common = places[first][is_known[first] & is_known[second]]
         left, bottom, right, top = (float(side) for edge in (common.min(0), common.max(0)) for side in edge.round(2))
-        contents = [content(row, (left, bottom, right, top)) for row in (first, second)]
-        return _is_same_content(*contents)
+        one, other = (content(row, (left, bottom, right, top)) for row in (first, second))
+        # A negative and its positive show the same, too; pictures that cannot be read may do so.
+        return one is None or other is None or abs(float((one * other).sum())) > _SAME_CONTENT
 
     for row in np.argsort(-is_known.sum(axis=1), kind="stable").tolist():
         apart = np.nan_to_num(weight * np.linalg.norm(places[kept] - places[row], axis=2)).max(axis=1, initial=0)
@@ -102,11 +103,6 @@ def _content(scan: MeasuredScan, places: Array, box: Box, picture: Picture) -> A
     for place in places[np.isfinite(places[:, 0])]:
         detail[(np.abs(cells - place) < reach).all(axis=-1)] = 0.0
     return np.asarray(detail / max(float(np.linalg.norm(detail)), 1e-9))
-
-
-def _is_same_content(first: Array | None, second: Array | None) -> bool:
-    """Whether two pictures show the same, a negative and its positive too; pictures that cannot be read may do so."""
-    return first is None or second is None or abs(float((first * second).sum())) > _SAME_CONTENT
 
 
 def _repeated(

@@ -156,28 +156,22 @@ def _together(frame: FrameMeasurement, turn: str, told: bool, frames: int) -> Sc
     """Scan orientation of a frame with text in this direction. told: whether the frames together determine it."""
     assert frame.pose is not None
     pose = replace(frame.pose, name=_scan_pose(frame.pose, turn))
-    if not _face_is_known(pose) or _is_doubted(frame):
+    plain, mirrored = (
+        max((value for name, value in pose.written.items() if name.endswith("m") == is_mirrored), default=0.0)
+        for is_mirrored in (False, True)
+    )
+    # Whether the scan is mirrored is known by the frame alone; the frame itself may be a false detection.
+    is_face_known = abs(plain - mirrored) >= DECIDED
+    is_doubted = not any(mark.status == Status.MEASURED for mark in frame.marks) or any(
+        problem in frame.pose.evidence for problem in frame.problems
+    )
+    if is_doubted or not is_face_known:
         like = f"named {pose.name} as the other frames of the camera, so that its writing lies as theirs."
         return replace(pose, evidence=(*pose.evidence, like)) if pose.name != frame.pose.name else pose
     if not told:
         return replace(pose, evidence=(f"{_ONE_QUESTION}.", *pose.evidence[1:]), roll=_ONE_QUESTION)
     together = f"what is written lies alike in {frames} frames of the camera, and together they tell how it has it."
     return replace(pose, decided=True, evidence=(together, *pose.evidence[1:]))
-
-
-def _face_is_known(pose: ScanOrientation) -> bool:
-    """Whether the frame alone determines if its scan is mirrored."""
-    faces = [
-        max((value for name, value in pose.written.items() if name.endswith("m") == mirrored), default=0.0)
-        for mirrored in (False, True)
-    ]
-    return abs(faces[0] - faces[1]) >= DECIDED
-
-
-def _is_doubted(frame: FrameMeasurement) -> bool:
-    """Whether the frame itself may be a false detection."""
-    evidence = frame.pose.evidence if frame.pose else ()
-    return not any(mark.status == Status.MEASURED for mark in frame.marks) or any(p in evidence for p in frame.problems)
 
 
 def _turn(pose: ScanOrientation) -> str:

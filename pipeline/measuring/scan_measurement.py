@@ -3,7 +3,7 @@
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,18 +16,18 @@ from measure.fiducials.measurement import measure_fiducials, second_frame
 from measure.fiducials.rows import pitch_problem, with_damage
 from measure.flags import Code, Reason, Status
 from measure.marks.rendering import extent_px
-from measure.marks.shapes import FiducialLayout
 from measure.results import FrameMeasurement, MarkMeasurement, moved_frame
 from measure.scans.opening import crop_scan
-from measure.scans.remote import TRAFFIC, ScanPart, Window, public_text, scan_path
+from measure.scans.remote import TRAFFIC, ScanPart, public_text, scan_path
 from measure.scans.scan import Scan
 from pipeline.errors import InputError, what_to_do
+from pipeline.files.camera_file import CameraFile
 from pipeline.files.opencv_file import CalibratedLens
 from pipeline.measuring.learn_stage import prior_tone
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
-from pipeline.measuring.target_identification import misplaced_principal_point
 from pipeline.measuring.target_stage import measure_targets
 from pipeline.provenance import parts_hash
+from pipeline.results.comparator_file import comparator_from_pixel
 from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan
 from pipeline.results.thumbnail import ThumbnailRow, thumbnail_rows
 from pipeline.text.wording import capitalised
@@ -43,6 +43,7 @@ _FAILURES: Mapping[type[Exception], FailureCode] = {  # the first that fits
     InputError: FailureCode.PITCH,
 }
 _COUNTED = Path("/proc/self/io")
+_IN_THE_PICTURE = 0.4  # of the scan's size: largest offset of the principal point from its centre, if not cropped
 
 
 def ended_scan(task: ScanTask, error: Exception) -> MeasuredScan:
@@ -104,34 +105,31 @@ def _failure(task: ScanTask, error: Exception) -> tuple[FailureCode, str]:
 
 def _opened_and_measured(task: ScanTask, look: SecondPass | None) -> MeasuredScan:
     with task.opened() as scan:
-        window, lens = scan.path.window if isinstance(scan.path, ScanPart) else None, task.options.fiducials.lens
-        if isinstance(lens, CalibratedLens) and (misfit := lens.misfit(scan)):
+        options, fiducials = task.options, task.options.fiducials
+        if isinstance(fiducials.lens, CalibratedLens) and (misfit := fiducials.lens.misfit(scan)):
             raise MeasurementError(misfit)
         if scan.is_two_valued:
             raise MeasurementError(
                 f"{task.shown_scan} has black and white pixels only, and marks are measured by the grey values along "
                 "their edges: scan it again as grey or RGB with 8 or 16 bits a sample"
             )
-        measured = _measure_window(task, scan, window) if window else _measure(task, scan, task.options)
+        if isinstance(scan.path, ScanPart) and (window := scan.path.window):
+            try:
+                cropped = crop_scan(scan, window)
+            except ValueError as error:
+                raise MeasurementError(f"{scan.path}: {error}: correct images.csv") from None
+            col_px, row_px = first = np.array(window[:2], float)
+            clicks = (replace(one, col_px=one.col_px - col_px, row_px=one.row_px - row_px) for one in fiducials.clicks)
+            lens = None if fiducials.lens is None else fiducials.lens.crop(*window[:2])
+            options = replace(options, fiducials=replace(fiducials, clicks=tuple(clicks), lens=lens))
+            measured = _measure(task, cropped, options)
+            frame = moved_frame(measured.frame, first)  # in pixels of the whole scan
+            measured = replace(measured, width_px=scan.width_px, height_px=scan.height_px, frame=frame)
+        else:
+            measured = _measure(task, scan, options)
         if look is not None:
             look(scan, measured)
         return measured
-
-
-def _measure_window(task: ScanTask, scan: Scan, window: Window) -> MeasuredScan:
-    """Measure a window of a scan; all places are in pixels of the whole scan."""
-    try:
-        cropped = crop_scan(scan, window)
-    except ValueError as error:
-        raise MeasurementError(f"{scan.path}: {error}: correct images.csv") from None
-    first = np.array(window[:2], float)
-    fiducials = task.options.fiducials
-    clicks = (replace(one, col_px=one.col_px - first[0], row_px=one.row_px - first[1]) for one in fiducials.clicks)
-    lens = None if fiducials.lens is None else fiducials.lens.crop(*window[:2])
-    options = replace(task.options, fiducials=replace(fiducials, clicks=tuple(clicks), lens=lens))
-    measured = _measure(task, cropped, options)
-    frame = moved_frame(measured.frame, first)
-    return replace(measured, width_px=scan.width_px, height_px=scan.height_px, frame=frame)
 
 
 def _measure(task: ScanTask, scan: Scan, options: ScanOptions) -> MeasuredScan:
@@ -140,19 +138,44 @@ def _measure(task: ScanTask, scan: Scan, options: ScanOptions) -> MeasuredScan:
     # measured in the grey values as they are.
     tone = prior_tone(options.tone, scan.path).include_information(options.tone_information)
     frame = replace(_fiducials(options, scan.replace_tone(tone)), image=task.name)
-    pitch, problems, notes = _pitch(options, scan, frame)
+    pitch, problems, pitch_notes = _pitch(options, scan, frame)
     of_file = (Reason(f"{capitalised(problem)}.", Code.SECOND_PICTURE) for problem in scan.problems)
     frame = replace(frame, problems=(*of_file, *frame.problems, *problems))
-    curve = (frame.tone.note,) if frame.tone else ()
-    file_notes = (f"{capitalised(note)}." for note in scan.notes)
-    notes = (*file_notes, *frame.notes, *notes, *curve, *_missing_input(options, frame))
-    measured = MeasuredScan(task.shown_scan, scan.width_px, scan.height_px, pitch, frame, notes)
+    notes = [*(f"{capitalised(note)}." for note in scan.notes), *frame.notes, *pitch_notes]
+    if frame.tone:
+        notes.append(frame.tone.note)
+    writing, lens = options.fiducials.writing, options.fiducials.lens
+    is_open = writing == "pose" and frame.pose is not None and not frame.pose.decided
+    if (writing == "all" or is_open) and networks() is None:
+        notes.append(f"{capitalised(MISSING)}.")
+    if isinstance(lens, CalibratedLens) and not lens.is_covariance_known:
+        notes.append(
+            "The calibration of the taking lens gives no covariance: the lens is taken as exact. `reseau calibrate` "
+            "writes one into camera.yaml."
+        )
+    measured = MeasuredScan(task.shown_scan, scan.width_px, scan.height_px, pitch, frame, tuple(notes))
     if misplaced := misplaced_principal_point(options.camera, measured):
         measured = measured.changed(problems=[Reason(misplaced, Code.OFF_GIVEN)])
     registered = scan.replace_weights(frame.weights) if frame.weights and frame.notes else scan
     if options.targets is not None:
         measured = measure_targets(options.targets, options.camera, options.exterior, registered, measured)
     return replace(measured, frame=with_damage(scan, measured.frame))
+
+
+def misplaced_principal_point(camera: CameraFile, measured: MeasuredScan) -> str:
+    """A sentence if the principal point of a camera without fiducials is hardly within the scan, as if counted from its
+    centre."""
+    if camera.fiducials or camera.principal_point_mm is None:
+        return ""
+    size = comparator_from_pixel(np.array([measured.width_px - 1, measured.height_px - 1]), measured.pitch_um)
+    if (np.abs(np.array(camera.principal_point_mm) - size / 2.0) < _IN_THE_PICTURE * np.abs(size)).all():
+        return ""
+    given, middle = (f"[{x:.4g}, {y:.4g}]" for x, y in (camera.principal_point_mm, (size / 2.0).tolist()))
+    return (
+        f"principal_point_mm = {given} is at the edge of the scan or beyond it. A camera without fiducials has it in "
+        f"comparator coordinates, from the scan's top-left pixel, x to the right and y up: the middle of this scan is "
+        f"{middle}. Give it so, or leave it out."
+    )
 
 
 def _fiducials(options: ScanOptions, scan: Scan) -> FrameMeasurement:
@@ -165,51 +188,29 @@ def _fiducials(options: ScanOptions, scan: Scan) -> FrameMeasurement:
             "needs it, for its size says nothing of the pitch."
         )
     measured = measure_fiducials(scan, layout, pitch, options.fiducials)
-    second = second_frame(scan, layout, measured, options.fiducials)
-    measured = replace(measured, problems=(*measured.problems, second) if second else measured.problems)
+    problems = [second_frame(scan, layout, measured, options.fiducials)]
     if pitch is not None:
         source = "the project" if options.pitch_um is not None else "the scan's file"
-        wrong = pitch_problem(measured, layout, pitch, source)
-        measured = replace(measured, problems=(*measured.problems, wrong) if wrong else measured.problems)
-    if options.known_pose is not None and measured.pose is not None:
-        measured = replace(measured, pose=options.known_pose)
-    return replace(measured, marks=_add_sizes(measured, layout, scan, pitch))
+        problems.append(pitch_problem(measured, layout, pitch, source))
+    pose = options.known_pose if options.known_pose is not None and measured.pose is not None else measured.pose
+    # The size at which each mark is drawn in the scan serves the display of image patches.
+    if measured.px_per_mm is not None:
+        px_per_mm = measured.px_per_mm
+    elif pitch is not None:
+        px_per_mm = 1000.0 / pitch[0]
+    else:
+        px_per_mm = scan.width_px / layout.frame_mm[0]
+    drawn = np.array([[px_per_mm, 0.0, 0.0], [0.0, -px_per_mm, 0.0]])
+    extents = {mark.id: np.ptp(np.stack(extent_px(mark.mark, drawn)), axis=0).max() for mark in layout.marks}
+    marks = [replace(one, quality={**one.quality, "size_px": float(extents[one.point])}) for one in measured.marks]
+    found = (*measured.problems, *(problem for problem in problems if problem))
+    return replace(measured, marks=tuple(marks), problems=found, pose=pose)
 
 
 def reads_writing(options: ScanOptions) -> bool:
     """Whether text would be read. The results depend on this in addition to scan and options: the text networks are an
     optional extra."""
     return options.fiducials.writing != "none" and networks() is not None
-
-
-def _missing_input(options: ScanOptions, frame: FrameMeasurement) -> Iterator[str]:
-    """Yield notes where text should be read without the networks for it, or the taking lens has no covariance."""
-    writing, lens = options.fiducials.writing, options.fiducials.lens
-    is_open = writing == "pose" and frame.pose is not None and not frame.pose.decided
-    if (writing == "all" or is_open) and networks() is None:
-        yield f"{capitalised(MISSING)}."
-    if isinstance(lens, CalibratedLens) and not lens.is_covariance_known:
-        yield (
-            "The calibration of the taking lens gives no covariance: the lens is taken as exact. `reseau calibrate` "
-            "writes one into camera.yaml."
-        )
-
-
-def _add_sizes(
-    measured: FrameMeasurement, layout: FiducialLayout, scan: Scan, pitch_um: tuple[float, float] | None
-) -> tuple[MarkMeasurement, ...]:
-    """Add to each mark the size at which it is drawn in the scan, in px, for the display of image patches."""
-    if measured.px_per_mm is not None:
-        px_per_mm = measured.px_per_mm
-    elif pitch_um is not None:
-        px_per_mm = 1000.0 / pitch_um[0]
-    else:
-        px_per_mm = scan.width_px / layout.frame_mm[0]
-    drawn = np.array([[px_per_mm, 0.0, 0.0], [0.0, -px_per_mm, 0.0]])
-    extents = {mark.id: np.ptp(np.stack(extent_px(mark.mark, drawn)), axis=0).max() for mark in layout.marks}
-    return tuple(
-        replace(mark, quality={**mark.quality, "size_px": float(extents[mark.point])}) for mark in measured.marks
-    )
 
 
 def _pitch(

@@ -133,7 +133,11 @@ def image_options(
     """Function that returns the options of an image by its name; see `scan_tasks`."""
     cameras = {name: _sought(project, camera) for name, camera in project.cameras.items()}
     key_of = {id(camera): name for name, camera in project.cameras.items()}
-    targets = _targets(project)
+    targets = None
+    if project.targets is not None:
+        from pipeline.measuring.target_stage import SoughtTargets  # late: it imports the detection of targets
+
+        targets = SoughtTargets.from_project(project)
     shared: dict[tuple[object, ...], ScanOptions] = {}
 
     def options_for(name: str) -> ScanOptions:
@@ -160,14 +164,6 @@ def image_options(
         return shared[key]
 
     return options_for
-
-
-def _targets(project: Project) -> "SoughtTargets | None":
-    if project.targets is None:
-        return None
-    from pipeline.measuring.target_stage import SoughtTargets  # late: it imports the detection of targets
-
-    return SoughtTargets.from_project(project)
 
 
 def sample_names(names: Sequence[str], count: int) -> list[str]:

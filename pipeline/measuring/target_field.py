@@ -241,19 +241,20 @@ def checked_places(
     comparison = compare_targets(targets, places_px, covariances, (scan.width_px, scan.height_px))
     far = np.linalg.norm(comparison.off_px, axis=1)
     verdicts = dict(zip(observed, zip(far.tolist(), comparison.chance.tolist(), strict=True), strict=True))
-    return tuple(_apply_verdict(mark, verdicts) for mark in marks)
-
-
-def _apply_verdict(mark: MarkMeasurement, verdicts: Mapping[str, tuple[float, float]]) -> MarkMeasurement:
-    off_px, chance = verdicts.get(mark.point, (0.0, 1.0))
-    if chance > TARGET_OFF_PLACE:
-        return mark
-    how = f"it lies {off_px:.2f} px from where the other targets put it"
-    if chance < TARGET_ELSEWHERE:
-        wrong = Reason(f"another mark, or the point's coordinates are wrong: {how}", Code.OFF_PLACE)
-        return replace(mark, status=Status.REJECTED, reason=wrong)
-    reason = Reason(f"{how}, as one of {1.0 / chance:.0f} right ones does", Code.OFF_PLACE)
-    return replace(mark, status=Status.WEAK, reason=Reason.combine((mark.reason, reason)))
+    checked = []
+    for mark in marks:
+        off_px, chance = verdicts.get(mark.point, (0.0, 1.0))
+        if chance > TARGET_OFF_PLACE:
+            checked.append(mark)
+            continue
+        how = f"it lies {off_px:.2f} px from where the other targets put it"
+        if chance < TARGET_ELSEWHERE:
+            wrong = Reason(f"another mark, or the point's coordinates are wrong: {how}", Code.OFF_PLACE)
+            checked.append(replace(mark, status=Status.REJECTED, reason=wrong))
+        else:
+            reason = Reason(f"{how}, as one of {1.0 / chance:.0f} right ones does", Code.OFF_PLACE)
+            checked.append(replace(mark, status=Status.WEAK, reason=Reason.combine((mark.reason, reason))))
+    return tuple(checked)
 
 
 def target_places(field: Field, model: ImageModel, scan: MeasuredScan) -> TargetPlaces:

@@ -29,10 +29,6 @@ _SIGMA_PX = 0.5  # px, of a candidate, including locally varying effects of ecce
 _FOUND_WITHIN_PX = 2.0  # px, largest shift of the fit from the candidate
 _STRAYS = 1.5  # candidates per target, the strongest: dust and texture are weaker than painted targets
 _NEIGHBOURS = 4  # identified targets next to a missed one, from which its offset is estimated
-_SIZES = 4.0  # largest ratio of a target's size to that in an image filled by the whole field
-
-
-_IN_THE_PICTURE = 0.4  # of the scan's size: largest offset of the principal point from its centre, if not cropped
 
 
 def recognise(predicted_px: Array, found_px: Array, shift_px: float) -> dict[int, int]:
@@ -85,13 +81,6 @@ def _hits(places: Array, tree: cKDTree, gate_px: float) -> tuple[Mask, Indices]:
     once = np.zeros(len(places), dtype=bool)
     once[order[np.unique(nearest[order], return_index=True)[1]]] = True
     return once & (distances <= gate_px), nearest
-
-
-def likely_diameters_px(field: Field, measured: MeasuredScan) -> tuple[float, float]:
-    """Smallest and largest plausible diameter of a target, if the field roughly fills the image."""
-    size = float(np.linalg.norm(np.ptp(field.xyz, axis=0)))
-    filling = 2.0 * field.radius / size * float(np.hypot(measured.width_px, measured.height_px))
-    return filling / _SIZES, filling * _SIZES
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,30 +159,19 @@ def camera_model(camera: CameraFile, measured: MeasuredScan) -> ImageModel | str
 
     Where the camera file gives no principal distance, the scan's diagonal serves as a rough value.
     """
-    film = _camera_from_comparator(camera, measured)
-    if film is None:
+    if not camera.fiducials:
+        film = Film("none", np.zeros(0), np.zeros(2))
+    elif measured.frame.pixel_from_camera is None:
         return "too few fiducials were measured to know where the camera's frame lies in the scan"
+    else:
+        places = np.linalg.inv(np.vstack([measured.frame.pixel_from_camera, [0.0, 0.0, 1.0]]))[:2]
+        linear = places[:, :2] @ np.diag(pixel_from_comparator(np.ones(2), measured.pitch_um))
+        film = Film("affine", np.array([places[0, 2], *linear[0], places[1, 2], *linear[1]]), np.zeros(2))
     middle = comparator_from_pixel(np.array([measured.width_px - 1, measured.height_px - 1]) / 2.0, measured.pitch_um)
     c = camera.principal_distance_mm or 2.0 * float(np.linalg.norm(middle))
     x0, y0 = middle if camera.principal_point_mm is None else camera.principal_point_mm
     lens = Lens(camera.distortion, np.array([c, x0, y0], dtype=np.float64), camera.distortion.values)
     return ImageModel(lens, np.eye(3), np.zeros(3), film)
-
-
-def misplaced_principal_point(camera: CameraFile, measured: MeasuredScan) -> str:
-    """A sentence if the principal point of a camera without fiducials is hardly within the scan, as if counted from its
-    centre."""
-    if camera.fiducials or camera.principal_point_mm is None:
-        return ""
-    size = comparator_from_pixel(np.array([measured.width_px - 1, measured.height_px - 1]), measured.pitch_um)
-    if (np.abs(np.array(camera.principal_point_mm) - size / 2.0) < _IN_THE_PICTURE * np.abs(size)).all():
-        return ""
-    given, middle = (f"[{x:.4g}, {y:.4g}]" for x, y in (camera.principal_point_mm, (size / 2.0).tolist()))
-    return (
-        f"principal_point_mm = {given} is at the edge of the scan or beyond it. A camera without fiducials has it in "
-        f"comparator coordinates, from the scan's top-left pixel, x to the right and y up: the middle of this scan is "
-        f"{middle}. Give it so, or leave it out."
-    )
 
 
 def frame_mm(camera: CameraFile, model: ImageModel, measured: MeasuredScan) -> Array:
@@ -205,14 +183,3 @@ def frame_mm(camera: CameraFile, model: ImageModel, measured: MeasuredScan) -> A
         half = np.array(camera.frame_mm) / 2.0
         shown_mm = np.clip(shown_mm, -half, half)
     return np.stack([shown_mm.min(axis=0), shown_mm.max(axis=0)])
-
-
-def _camera_from_comparator(camera: CameraFile, measured: MeasuredScan) -> Film | None:
-    """Film transformation from the measured fiducials; the identity for a camera without fiducials."""
-    if not camera.fiducials:
-        return Film("none", np.zeros(0), np.zeros(2))
-    if measured.frame.pixel_from_camera is None:
-        return None
-    places = np.linalg.inv(np.vstack([measured.frame.pixel_from_camera, [0.0, 0.0, 1.0]]))[:2]
-    linear = places[:, :2] @ np.diag(pixel_from_comparator(np.ones(2), measured.pitch_um))
-    return Film("affine", np.array([places[0, 2], *linear[0], places[1, 2], *linear[1]]), np.zeros(2))

@@ -13,7 +13,6 @@ from measure.boards.specs import BoardSpec
 from measure.flags import Code, Reason
 from measure.results import ON_FILM, MarkMeasurement
 from measure.scans.scan import Scan
-from measure.targets.identification import TargetPrediction
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
@@ -32,7 +31,6 @@ from pipeline.measuring.target_field import (
 from pipeline.measuring.target_identification import (
     NamedField,
     camera_model,
-    likely_diameters_px,
     name_field,
     recognise,
 )
@@ -46,6 +44,7 @@ LEAST_PAIRS = 4  # pairs of points and marks needed to identify an image's targe
 
 _STRONGEST = 3  # candidates per target, by contrast: dust and texture are weaker than painted targets
 _NEAR = 0.65  # of the scan's size, from its centre: targets predicted closer may be in the scan
+_SIZES = 4.0  # largest ratio of a target's size to that in an image filled by the whole field
 _SIZE_SLACK = 1.5  # largest factor of the error of a target's size due to the approximate distance
 
 
@@ -76,7 +75,18 @@ class SoughtTargets:
         coded = CodedPoints.from_project(project, settings) if settings.code is not None else None
         field = target_field(project)
         if settings.board is None and coded is None:
-            _check(project, settings, field)
+            if project.given_points is None:
+                raise InputError(
+                    f"{project.path}: [targets] kind {settings.kind!r} is named by the targets' coordinates, and there "
+                    'is no [object] points = "...". Give the file of the points, or leave [targets] out to measure '
+                    "fiducials only."
+                )
+            if len(field.ids) < LEAST_PAIRS:
+                raise InputError(
+                    f"{project.path}: [object] points: {len(field.ids)} points with X, Y and Z name no targets; give "
+                    f"{LEAST_PAIRS}, if only roughly."
+                )
+            check_spacing(project, field)
         return cls(settings, field, coded, project.given_points is not None, project.unit, project.unit_mm)
 
     @property
@@ -85,20 +95,6 @@ class SoughtTargets:
         if self.coded is not None:
             return self.coded.ids
         return tuple(self.settings.board.object_points()) if self.settings.board else self.field.ids
-
-
-def _check(project: Project, settings: TargetSettings, field: Field) -> None:
-    if project.given_points is None:
-        raise InputError(
-            f"{project.path}: [targets] kind {settings.kind!r} is named by the targets' coordinates, and there is no "
-            '[object] points = "...". Give the file of the points, or leave [targets] out to measure fiducials only.'
-        )
-    if len(field.ids) < LEAST_PAIRS:
-        raise InputError(
-            f"{project.path}: [object] points: {len(field.ids)} points with X, Y and Z name no targets; give "
-            f"{LEAST_PAIRS}, if only roughly."
-        )
-    check_spacing(project, field)
 
 
 def measure_targets(
@@ -158,30 +154,18 @@ def _named(
         if isinstance(named, NamedField):
             return named, ()
         notes = (f"Its orientation in images.csv was not used to name the targets: {named}.",)
-    diameters = likely_diameters_px(field, measured)
-    if diameters[1] < LEAST_DIAMETER_PX:
-        return _too_small(sought, diameters[1]), notes
-    return name_field(field, model, camera, measured, target_candidates(scan, sought.settings, diameters)), notes
-
-
-def _too_small(sought: SoughtTargets, largest_px: float) -> str:
-    field = sought.field
+    # diameter of a target where the field fills the image
     extent = float(np.linalg.norm(np.ptp(field.xyz, axis=0)))
-    return (
-        f"targets of {2.0 * field.radius * sought.unit_mm:g} mm in a field of {extent:g} {sought.unit} would have "
-        f"{largest_px:.2g} px at most, and {LEAST_DIAMETER_PX} are needed; is [object] unit the one of the "
-        f'coordinates? "{sought.unit}" is taken, "m" being the default'
-    )
-
-
-def _diameters_px(predictions: Sequence[TargetPrediction], measured: MeasuredScan) -> tuple[float, float] | None:
-    """Smallest and largest expected diameter of the targets in or near the scan; None where none is large enough."""
-    size = np.array([measured.width_px, measured.height_px])
-    near = [p for p in predictions if np.all(np.abs(p.center_px - size / 2.0) < _NEAR * size)]
-    axes = np.array([p.half_axes_px for p in near]).reshape(-1, 2)
-    if not len(axes) or 2.0 * float(axes.max()) < LEAST_DIAMETER_PX:
-        return None
-    return 2.0 * float(axes.min()) / _SIZE_SLACK, 2.0 * float(axes.max()) * _SIZE_SLACK
+    filling = 2.0 * field.radius / extent * float(np.hypot(measured.width_px, measured.height_px))
+    diameters = filling / _SIZES, filling * _SIZES
+    if diameters[1] < LEAST_DIAMETER_PX:
+        too_small = (
+            f"targets of {2.0 * field.radius * sought.unit_mm:g} mm in a field of {extent:g} {sought.unit} would have "
+            f"{diameters[1]:.2g} px at most, and {LEAST_DIAMETER_PX} are needed; is [object] unit the one of the "
+            f'coordinates? "{sought.unit}" is taken, "m" being the default'
+        )
+        return too_small, notes
+    return name_field(field, model, camera, measured, target_candidates(scan, sought.settings, diameters)), notes
 
 
 def _named_by_orientation(
@@ -190,9 +174,12 @@ def _named_by_orientation(
     """Identify the targets by the pattern that an approximate orientation predicts; or the reason of the failure."""
     field = sought.field
     predictions = field.predictions(approximate, measured, search_px=1.0)
-    diameters = _diameters_px(predictions, measured)
-    if diameters is None:
+    size = np.array([measured.width_px, measured.height_px])
+    near = [one for one in predictions if np.all(np.abs(one.center_px - size / 2.0) < _NEAR * size)]
+    axes = np.array([one.half_axes_px for one in near]).reshape(-1, 2)
+    if not len(axes) or 2.0 * float(axes.max()) < LEAST_DIAMETER_PX:
         return f"the approximate orientation puts no target of {LEAST_DIAMETER_PX} px or more into the scan"
+    diameters = 2.0 * float(axes.min()) / _SIZE_SLACK, 2.0 * float(axes.max()) * _SIZE_SLACK
     strongest = target_candidates(scan, sought.settings, diameters)[: _STRONGEST * len(predictions)]
     predicted, found = (np.array([one.center_px for one in some]).reshape(-1, 2) for some in (predictions, strongest))
     row = {id: i for i, id in enumerate(field.ids)}

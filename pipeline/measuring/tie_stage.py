@@ -34,7 +34,7 @@ _NO_FRAME = Reason(
 )
 
 
-def add_joins(
+def _add_joins(
     project: Project, scans: Sequence[MeasuredScan], count: Count, workers: Executor | None
 ) -> tuple[MeasuredScan, ...]:
     """Add joins to the partial scans of each frame.
@@ -48,27 +48,22 @@ def add_joins(
             by_frame.setdefault(frame, []).append(scan)
     joined: dict[str, MeasuredScan] = {}
     for done, (frame, parts) in enumerate(sorted(by_frame.items()), 1):
-        joined |= {scan.frame.image: scan for scan in _join_parts(project, frame, parts, workers)}
+        if len(parts) < 2:
+            alone = f"It is a part of frame {frame}, of which no other scan could be measured: nothing joins it."
+            joined |= {scan.frame.image: scan.changed(problems=[Reason(alone, Code.FEW_TIES)]) for scan in parts}
+        else:
+            parts.sort(key=lambda scan: scan.frame.image)
+            frames = []
+            for scan in parts:
+                name, path = scan.frame.image, scan_path(scan.scan)
+                occupied = _occupied_places([mark for mark in scan.frame.marks if mark.kind == "fiducial"])
+                frames.append(TieFrame(name, path, np.eye(2, 3), None, occupied, project.max_pixels))
+            joins = measure_joins(frames, workers=workers)
+            problems = {image: (problem,) for image, problem in joins.problems.items()}
+            with_joins = [_add_marks(scan, joins.marks, problems) for scan in parts]
+            joined |= {scan.frame.image: scan for scan in _agreed(with_joins)}
         count(frame, done, len(by_frame))
     return tuple(joined.get(scan.frame.image, scan) for scan in scans)
-
-
-def _join_parts(
-    project: Project, frame: str, parts: Sequence[MeasuredScan], workers: Executor | None
-) -> list[MeasuredScan]:
-    if len(parts) < 2:
-        lacking = Reason(
-            f"It is a part of frame {frame}, of which no other scan could be measured: nothing joins it.", Code.FEW_TIES
-        )
-        return [scan.changed(problems=[lacking]) for scan in parts]
-    parts = sorted(parts, key=lambda scan: scan.frame.image)
-    frames = []
-    for scan in parts:
-        marks = _occupied_places([mark for mark in scan.frame.marks if mark.kind == "fiducial"])
-        frames.append(TieFrame(scan.frame.image, scan_path(scan.scan), np.eye(2, 3), None, marks, project.max_pixels))
-    joins = measure_joins(frames, workers=workers)
-    problems = {image: (problem,) for image, problem in joins.problems.items()}
-    return _agreed([_add_marks(scan, joins.marks, problems) for scan in parts])
 
 
 def _add_marks(
@@ -95,8 +90,7 @@ def _agreed(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
     checked = set[str]()
     for i, first in enumerate(scans):
         for second in scans[i + 1 :]:
-            second_from_first = _movement(first, second)
-            off_mm = None if second_from_first is None else _discrepancy_mm(first, second, second_from_first)
+            off_mm = _discrepancy_mm(first, second)
             if off_mm is None:
                 continue
             both = [
@@ -107,20 +101,25 @@ def _agreed(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
                 continue
             for scan, other in ((first, second), (second, first)):
                 result[scan.frame.image] = _contradicted(result[scan.frame.image], other, off_mm)
-    checked_parts = [_unchecked(result[scan.frame.image], scan.frame.image in checked) for scan in scans]
-    return [_excuse_outside(scan, checked_parts) for scan in checked_parts]
-
-
-def _excuse_outside(scan: MeasuredScan, parts: Sequence[MeasuredScan]) -> MeasuredScan:
-    """Give another reason to fiducials outside of a scan that another partial scan shows: they are not missing."""
-    shown = {point: part.frame.image for part in reversed(parts) for point in _fiducials(part)}
-    marks = [
-        replace(mark, reason=Reason(f"it lies in {shown[mark.point]}, another scan of its frame", Code.OTHER_PART))
-        if mark.kind == "fiducial" and Code.OUTSIDE in mark.reason.codes and mark.point in shown
-        else mark
-        for mark in scan.frame.marks
-    ]
-    return scan.changed(marks)
+    for image, scan in result.items():
+        if image in checked:
+            problems = tuple(problem for problem in scan.frame.problems if problem.codes != (Code.NO_CHECK,))
+            result[image] = replace(scan, frame=replace(scan.frame, problems=problems))
+        elif 0 < len(_fiducials(scan)) < _CHECKED:
+            few = Reason("so few fiducials fit many frames, and no other part of this one checks them", Code.NO_CHECK)
+            result[image] = scan.restated("fiducial", Status.WEAK, few)
+    # Fiducials outside of a scan that another partial scan shows are not missing.
+    shown = {point: image for image, scan in reversed(result.items()) for point in _fiducials(scan)}
+    agreed = []
+    for scan in result.values():
+        marks = [
+            replace(mark, reason=Reason(f"it lies in {shown[mark.point]}, another scan of its frame", Code.OTHER_PART))
+            if mark.kind == "fiducial" and Code.OUTSIDE in mark.reason.codes and mark.point in shown
+            else mark
+            for mark in scan.frame.marks
+        ]
+        agreed.append(scan.changed(marks))
+    return agreed
 
 
 def _fiducials(scan: MeasuredScan) -> dict[str, Array]:
@@ -131,29 +130,28 @@ def _fiducials(scan: MeasuredScan) -> dict[str, Array]:
     }
 
 
-def _movement(first: MeasuredScan, second: MeasuredScan) -> Array | None:
-    """(2, 3) similarity from pixels of the first scan to the second, from their joins; None where they are too few."""
+def _discrepancy_mm(first: MeasuredScan, second: MeasuredScan) -> float | None:
+    """RMS distance of the second scan's fiducials from their places by the first scan's frame and the joins, in mm.
+
+    None where there are too few joins, no frame or no fiducials.
+    """
     places = [
         {mark.point: mark.center_px for mark in scan.frame.marks if mark.kind == "join" and mark.status.is_observation}
         for scan in (first, second)
     ]
     common = sorted(places[0].keys() & places[1].keys())
-    if len(common) < _FEWEST:
+    frame, second_frame = first.frame.pixel_from_camera, second.frame.pixel_from_camera
+    fiducials = _fiducials(second)
+    if len(common) < _FEWEST or frame is None or second_frame is None or not fiducials:
         return None
+    # similarity from pixels of the first scan to the second, as complex numbers
     here, there = (np.array([of[point] for point in common]) @ (1.0, 1.0j) for of in places)
     scale = np.vdot(here - here.mean(), there - there.mean()) / np.vdot(here - here.mean(), here - here.mean())
     shift = there.mean() - scale * here.mean()
-    return np.array([[scale.real, -scale.imag, shift.real], [scale.imag, scale.real, shift.imag]])
-
-
-def _discrepancy_mm(first: MeasuredScan, second: MeasuredScan, second_from_first: Array) -> float | None:
-    """RMS distance of the second scan's fiducials from their places by the first scan's frame and the joins, in mm."""
-    frame, second_frame = first.frame.pixel_from_camera, second.frame.pixel_from_camera
-    if frame is None or second_frame is None or not _fiducials(second):
-        return None
-    there = np.array(list(_fiducials(second).values()))
-    here = Affine(frame).apply(Affine(second_frame).inverse.apply(there))
-    off_px = np.hypot(*(Affine(second_from_first).apply(here) - there).T)
+    second_from_first = np.array([[scale.real, -scale.imag, shift.real], [scale.imag, scale.real, shift.imag]])
+    found_px = np.array(list(fiducials.values()))
+    in_first_px = Affine(frame).apply(Affine(second_frame).inverse.apply(found_px))
+    off_px = np.hypot(*(Affine(second_from_first).apply(in_first_px) - found_px).T)
     return float(np.sqrt(np.mean(off_px**2))) / (second.frame.px_per_mm or 1.0)
 
 
@@ -173,17 +171,6 @@ def _contradicted(scan: MeasuredScan, other: MeasuredScan, off_mm: float) -> Mea
     return scan.changed(problems=[problem])
 
 
-def _unchecked(scan: MeasuredScan, is_checked: bool) -> MeasuredScan:
-    """Mark fiducials too few to check one another as weak; where the joins check them, drop that problem."""
-    if is_checked:
-        problems = tuple(problem for problem in scan.frame.problems if problem.codes != (Code.NO_CHECK,))
-        return replace(scan, frame=replace(scan.frame, problems=problems))
-    if 0 < len(_fiducials(scan)) < _CHECKED:
-        reason = Reason("so few fiducials fit many frames, and no other part of this one checks them", Code.NO_CHECK)
-        return scan.restated("fiducial", Status.WEAK, reason)
-    return scan
-
-
 def check_tie_names(project: Project) -> None:
     """Raise InputError where a given point has a name reserved for natural points."""
     reserved = sorted(id for id in project.object_points if _TIE_NAME.fullmatch(id)) if project.ties else []
@@ -194,33 +181,27 @@ def check_tie_names(project: Project) -> None:
         )
 
 
-def add_ties(
+def _add_ties(
     project: Project, settings: TieSettings, scans: Sequence[MeasuredScan], count: Count, workers: Executor | None
 ) -> tuple[MeasuredScan, ...]:
-    """Measure natural tie points and add them to the scans."""
-    frames = {scan.frame.image: _tie_frame(project, scan) for scan in scans}
-    placed = [frame for frame in frames.values() if frame is not None]
-    ties = measure_ties(placed, settings.options, count, workers)
-    problems = {**ties.problems, **{image: (_NO_FRAME,) for image, frame in frames.items() if frame is None}}
-    return tuple(_add_marks(scan, ties.marks, problems) for scan in scans)
-
-
-def _tie_frame(project: Project, scan: MeasuredScan) -> TieFrame | None:
-    """Frame for the tie points; None where the camera has fiducials and too few of them were measured."""
-    camera = project.image_camera(scan.frame.image)
-    pixel_from_camera, frame_mm = scan.frame.pixel_from_camera, camera.frame_mm
-    if pixel_from_camera is None:
-        if camera.fiducials:
-            return None
-        middle = np.array([scan.width_px - 1, scan.height_px - 1]) / 2
-        pixel_from_camera = np.column_stack([np.diag([1000.0, -1000.0] / np.array(scan.pitch_um)), middle])
-        frame_mm = None
-    path, marks, frame = (
-        scan_path(scan.scan),
-        _occupied_places(scan.frame.marks),
-        project.scanned_frame(scan.frame.image),
-    )
-    return TieFrame(scan.frame.image, path, pixel_from_camera, frame_mm, marks, project.max_pixels, frame)
+    """Measure natural tie points and add them to the scans; not where a camera has fiducials and too few of them were
+    measured."""
+    frames, problems = list[TieFrame](), dict[str, Sequence[Reason]]()
+    for scan in scans:
+        image = scan.frame.image
+        camera, pixel_from_camera = project.image_camera(image), scan.frame.pixel_from_camera
+        frame_mm = camera.frame_mm
+        if pixel_from_camera is None:
+            if camera.fiducials:
+                problems[image] = (_NO_FRAME,)
+                continue
+            middle = np.array([scan.width_px - 1, scan.height_px - 1]) / 2
+            pixel_from_camera = np.column_stack([np.diag([1000.0, -1000.0] / np.array(scan.pitch_um)), middle])
+            frame_mm = None
+        path, occupied, part_of = scan_path(scan.scan), _occupied_places(scan.frame.marks), project.scanned_frame(image)
+        frames.append(TieFrame(image, path, pixel_from_camera, frame_mm, occupied, project.max_pixels, part_of))
+    ties = measure_ties(frames, settings.options, count, workers)
+    return tuple(_add_marks(scan, ties.marks, {**ties.problems, **problems}) for scan in scans)
 
 
 def tie_scans(
@@ -231,9 +212,9 @@ def tie_scans(
     together = check_sheet(project, [scan for scan in scans if not scan.failure])
     if project.has_parts:
         with reporter.stage("joining parts of frame") as count:
-            together = add_joins(project, together, count, executor)
+            together = _add_joins(project, together, count, executor)
     if project.ties is not None:
         with reporter.stage("natural points of scan") as count:
-            together = add_ties(project, project.ties, together, count, executor)
+            together = _add_ties(project, project.ties, together, count, executor)
     by_image = {scan.frame.image: scan for scan in together}
     return tuple(by_image.get(scan.frame.image, scan) for scan in scans)

@@ -209,7 +209,18 @@ def compare_corners(
 
     Returns None where too few images are available, or OpenCV finds the board in too few of them.
     """
-    both = [pair for image in images if (pair := _paired(image, pictures)) is not None]
+    both = []
+    for image in images:
+        own_mm = pictures.points_mm(image.image)
+        if len(own_mm) == 0 or len(image.xyz) < 2:
+            continue
+        # OpenCV's points take the names of the nearest measured ones.
+        apart_mm = np.asarray(KDTree(image.xy_mm).query(image.xy_mm, k=2)[0])[:, 1]
+        distance_mm, nearest = (np.asarray(each) for each in KDTree(own_mm).query(image.xy_mm))
+        rows = np.flatnonzero(distance_mm < NEAREST * apart_mm)
+        xyz, xy_mm = image.xyz[rows], image.xy_mm[rows]
+        if can_begin(xyz):
+            both.append((ImagePoints(image.image, xyz, xy_mm), ImagePoints(image.image, xyz, own_mm[nearest[rows]])))
     if len(both) < FEWEST_PICTURES:
         return None
     found = {image.image for image, _ in both}
@@ -226,20 +237,6 @@ def compare_corners(
         _pixel_calibration(measured, pitch_mm),
         _pixel_calibration(own, pitch_mm),
     )
-
-
-def _paired(image: ImagePoints, pictures: BoardPictures) -> tuple[ImagePoints, ImagePoints] | None:
-    """OpenCV's points with the names of the nearest measured ones; None where there are too few."""
-    own_mm = pictures.points_mm(image.image)
-    if len(own_mm) == 0 or len(image.xyz) < 2:
-        return None
-    apart_mm = np.asarray(KDTree(image.xy_mm).query(image.xy_mm, k=2)[0])[:, 1]
-    distance_mm, nearest = (np.asarray(each) for each in KDTree(own_mm).query(image.xy_mm))
-    rows = np.flatnonzero(distance_mm < NEAREST * apart_mm)
-    if not can_begin(image.xyz[rows]):
-        return None
-    xyz = image.xyz[rows]
-    return ImagePoints(image.image, xyz, image.xy_mm[rows]), ImagePoints(image.image, xyz, own_mm[nearest[rows]])
 
 
 def _pixel_calibration(calibration: OpenCvCalibration, pitch_mm: Array) -> PixelCalibration:
@@ -259,21 +256,19 @@ def check_against_opencv(adjustment: Adjustment, pictures: BoardPictures | None 
     ----------
     pictures : images of a board; for digital cameras, OpenCV's own points in them are calibrated, too.
     """
-    names = [camera.name for camera in adjustment.network.cameras]
-    return Check.from_cameras({name: _check_camera(adjustment, name, pictures) for name in names})
+    checks = {}
+    for camera in adjustment.network.cameras:
+        known: dict[str, Any] = {}  # results of the check up to a failure
+        try:
+            verdict, reason = _compare(adjustment, camera.name, pictures, known)
+        except _NotPossible as hindrance:
+            verdict, reason = "not possible", str(hindrance)
+        checks[camera.name] = CameraCheck(verdict, reason, **known)
+    return Check.from_cameras(checks)
 
 
 class _NotPossible(Exception):
     """Reason why no comparison is possible."""
-
-
-def _check_camera(adjustment: Adjustment, name: str, pictures: BoardPictures | None) -> CameraCheck:
-    known: dict[str, Any] = {}  # results of the check up to a failure
-    try:
-        verdict, reason = _compare(adjustment, name, pictures, known)
-    except _NotPossible as hindrance:
-        verdict, reason = "not possible", str(hindrance)
-    return CameraCheck(verdict, reason, **known)
 
 
 def _hindrance(adjustment: Adjustment, name: str) -> str:
@@ -335,7 +330,8 @@ def _compare(
         raise _NotPossible("No image shows enough points for OpenCV: 4 in a plane, 6 otherwise.")
     known |= {"images": len(problem.images), "points": sum(len(image.xyz) for image in problem.images)}
     solved = _solve_without_priors(problem)
-    rms_um, sigma_um = _rms_um(solved), 1e3 * problem.sigma_mm
+    rms_um = 1e3 * float(np.sqrt((solved.residuals.v_mm**2).sum(axis=1).mean()))  # of the residual of a point
+    sigma_um = 1e3 * problem.sigma_mm
     known["rms_reseau_um"] = rms_um
     try:
         conversion = converted(problem, solved)
@@ -380,7 +376,7 @@ def _compare(
             f"leaves {refit_um:.3f} µm, which {known['points']} points notice. {reason}"
         )
     if verdict == "agrees" and sigmas_tell:
-        verdict, reason = _judge_departure(reason, _departures(adjustment, solved, camera))
+        verdict, reason = _judge_departure(reason, adjustment, solved, camera)
     if together:
         reason += f" {enumeration(together)} cannot be separated: the radial terms are not compared one by one."
     if not is_digital:  # whose pixels may have no size
@@ -394,11 +390,6 @@ def _is_digital(adjustment: Adjustment, problem: BareProblem) -> bool:
     camera = network.camera_by_name[problem.network.cameras[0].name]
     transformations = {network.image_by_name[image.image].transformation for image in problem.images}
     return not camera.fiducials and transformations == {"none"}
-
-
-def _rms_um(solved: Adjustment) -> float:
-    """RMS length of the residual of a point, µm."""
-    return 1e3 * float(np.sqrt((solved.residuals.v_mm**2).sum(axis=1).mean()))
 
 
 def _rows(
@@ -435,10 +426,16 @@ def _sigma_ratio(row: ComparedParameter) -> float:
 
 
 def _same_model_agrees(problem: BareProblem, conversion: Converted, opencv: OpenCvCalibration) -> bool:
-    """Whether the adjustment with OpenCV's own model gives OpenCV's solution."""
+    """Whether the adjustment with OpenCV's own distortion gives OpenCV's solution."""
     if problem.network.cameras[0].distortion.family in ("opencv", FISHEYE):
         return False
-    same = opencv_problem(problem, conversion.parameters)
+    fx, fy, x0, y0, *distortion = conversion.parameters.tolist()
+    values = {"c": fy, "x0": x0, "y0": y0, "b1": fx / fy - 1, "b2": 0.0}
+    values |= dict(zip(NAMES[4:], distortion, strict=True))
+    free = {"c", "x0", "y0", *problem.freedom.distortion}.difference(problem.freedom.held_interior)
+    camera = _freed(problem.network.cameras[0], Distortion("opencv"), values, free)
+    approximations = replace(problem.approximations, interior={camera.name: np.array([fy, x0, y0])})
+    same = replace(problem, network=replace(problem.network, cameras=(camera,)), approximations=approximations)
     solved = adjust(same.network, same.approximations)
     if not solved.converged:
         return False
@@ -446,17 +443,13 @@ def _same_model_agrees(problem: BareProblem, conversion: Converted, opencv: Open
     return all(r.difference_sigmas < SAME_MODEL_DIFFERENCE and _sigma_ratio(r) < SAME_MODEL_SIGMA_RATIO for r in rows)
 
 
-def _departures(adjustment: Adjustment, solved: Adjustment, camera: Camera) -> dict[str, float]:
-    """Differences between the full adjustment and the bare problem, in sigmas of the bare problem, by parameter."""
-    return {
+def _judge_departure(reason: str, adjustment: Adjustment, solved: Adjustment, camera: Camera) -> tuple[Verdict, str]:
+    """Verdict from the agreement on the bare problem and the departures of the full adjustment from it."""
+    departures = {  # in standard deviations of the bare problem
         each.quantity: abs(adjustment.value(each) - solved.value(each)) / solved.sigma(each)
         for each in (Parameter.interior(camera.name, name) for name in sorted(free_parameters(camera)))
         if solved.sigma(each) > 0 and not (solved.inseparable(camera.name) and each.quantity in OPENCV_RADIAL)
     }
-
-
-def _judge_departure(reason: str, departures: Mapping[str, float]) -> tuple[Verdict, str]:
-    """Verdict from the agreement on the bare problem and the departures of the full adjustment from it."""
     farthest = max(departures, key=lambda name: departures[name])
     sigmas = departures[farthest]
     alone = f"On the observations alone, {reason[0].lower()}{reason[1:]}"
@@ -540,26 +533,11 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
         gross=sum(
             network.observations.image[row] in shown for row in np.flatnonzero(adjustment.weights < GROSS_WEIGHT)
         ),
-        uncertain_points=sum(not _is_fixed(network.point_by_id[point]) for point in points),
+        uncertain_points=sum(
+            any(prior is None or prior.sigma != 0 for prior in network.point_by_id[point].priors) for point in points
+        ),
         left_out=tuple(name for name in names if name not in usable),
     )
-
-
-def opencv_problem(problem: BareProblem, parameters: Array) -> BareProblem:
-    """The bare problem with OpenCV's own distortion, from parameters (18,) in the order of `opencv_model.NAMES`."""
-    fx, fy, x0, y0, *distortion = parameters.tolist()
-    values = {
-        "c": fy,
-        "x0": x0,
-        "y0": y0,
-        **dict(zip(NAMES[4:], distortion, strict=True)),
-        "b1": fx / fy - 1,
-        "b2": 0.0,
-    }
-    free = {"c", "x0", "y0", *problem.freedom.distortion}.difference(problem.freedom.held_interior)
-    camera = _freed(problem.network.cameras[0], Distortion("opencv"), values, free)
-    approximations = replace(problem.approximations, interior={camera.name: np.array([fy, x0, y0])})
-    return replace(problem, network=replace(problem.network, cameras=(camera,)), approximations=approximations)
 
 
 def free_parameters(camera: Camera) -> set[str]:
@@ -608,10 +586,6 @@ def _image_points(adjustment: Adjustment, image: str) -> tuple[ImagePoints, Arra
     return ImagePoints(image, xyz, model.camera_from_comparator(observations.xy_mm[rows])), sigmas, points
 
 
-def _is_fixed(point: ObjectPoint) -> bool:
-    return all(prior is not None and prior.sigma == 0 for prior in (point.X, point.Y, point.Z))
-
-
 def _observations(shown: Mapping[str, tuple[ImagePoints, Array, list[str]]], sigma_mm: float) -> Observations:
     rows = [(name, point) for name, (_, _, points) in shown.items() for point in points]
     kinds: list[ObservationKind] = ["target"] * len(rows)
@@ -637,7 +611,8 @@ def converted(problem: BareProblem, solved: Adjustment) -> Converted:
         return Converted(parameters, np.sqrt(np.maximum(variances, 0.0)), 0.0)
     observed = problem.network.observations.xy_mm
     corners_mm = np.array([observed.min(axis=0), observed.max(axis=0)])
-    whole = to_opencv_model(lens, corners_mm, _whole(family))
+    fitted = ("k1", "k2", "p1", "p2", "k3", *(["b1"] if "fy" in COUNTERPARTS[family].values() else []))
+    whole = to_opencv_model(lens, corners_mm, ("b1",) if family in ("opencv", FISHEYE) else fitted)
     # OpenCV holds the parameters that it does not estimate at these values. Its standard deviations assume them.
     held = dict(zip(whole.lens.quantities[3:], whole.lens.parameters.tolist(), strict=True))
     model = fixed(whole.lens.distortion.family, held)
@@ -647,10 +622,3 @@ def converted(problem: BareProblem, solved: Adjustment) -> Converted:
     _, by_lens = opencv_values(free.lens)
     covariance = by_lens @ free.lens.covariance @ by_lens.T
     return Converted(parameters, np.sqrt(np.maximum(np.diag(covariance), 0.0)), whole.rms_mm)
-
-
-def _whole(family: str) -> tuple[str, ...]:
-    """Parameters of OpenCV's model that are fitted for a family."""
-    if family in ("opencv", FISHEYE):
-        return ("b1",)
-    return ("k1", "k2", "p1", "p2", "k3", *(["b1"] if "fy" in COUNTERPARTS[family].values() else []))

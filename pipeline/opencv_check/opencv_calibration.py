@@ -113,12 +113,6 @@ def opencv_values(lens: Lens) -> tuple[Array, Array]:
     return np.array(values), by_lens[:-1]
 
 
-def camera_matrix(values: Array) -> Array:
-    """OpenCV's camera matrix (3, 3), in mm with y down."""
-    fx, fy, cx, cy = values[:4]
-    return np.array([[fx, 0.0, cx], [0.0, fy, -cy], [0.0, 0.0, 1.0]])
-
-
 @dataclass(frozen=True)
 class ImagePoints:
     """One image for OpenCV: object points (n, 3) and their observations in the camera frame (n, 2), mm, y up."""
@@ -290,13 +284,10 @@ class _Pixels:
         objects = [(image.xyz - middle) / unit for image in images]
         return cls(objects, [image.xy_mm * Y_UP / mm - offset for image in images], mm, offset, (width, height))
 
-    @property
-    def places_px(self) -> Array:
-        return np.concatenate(self.places)
-
     def matrix(self, values: Array) -> Array:
         """OpenCV's camera matrix (3, 3) in px."""
-        matrix = camera_matrix(values) / self.mm
+        fx, fy, cx, cy = values[:4]
+        matrix = np.array([[fx, 0.0, cx], [0.0, fy, -cy], [0.0, 0.0, 1.0]]) / self.mm
         matrix[2, 2] = 1.0
         matrix[:2, 2] -= self.offset
         return matrix

@@ -30,7 +30,12 @@ def render_project(scene_path: Path, out_dir: Path, progress: Progress | None = 
     progress: called with the image's name, the steps done and the steps of the whole scene.
     """
     scene_file = read_scene(scene_path)
-    _check_free(out_dir)
+    own = [name for name in WRITTEN if (out_dir / name).exists()]
+    if own and not (out_dir / TRUTH).exists():  # a project that was not rendered
+        raise InputError(
+            f"{out_dir}: holds {' and '.join(own)}, which would be overwritten, and nothing says that they were "
+            "rendered. Name another folder."
+        )
     try:
         render_scene(scene_file.scene, out_dir, progress)
     except OSError as error:
@@ -38,16 +43,6 @@ def render_project(scene_path: Path, out_dir: Path, progress: Progress | None = 
             f"{out_dir}: cannot be written ({error.strerror or error}). Make room, or choose another folder."
         ) from error
     write_project(scene_file, out_dir)
-
-
-def _check_free(out_dir: Path) -> None:
-    """Raise InputError for a folder with a project that was not rendered: a rendered one holds truth.json."""
-    own = [name for name in WRITTEN if (out_dir / name).exists()]
-    if own and not (out_dir / TRUTH).exists():
-        raise InputError(
-            f"{out_dir}: holds {' and '.join(own)}, which would be overwritten, and nothing says that they were "
-            "rendered. Name another folder."
-        )
 
 
 def read_scene(path: Path) -> SceneFile:
@@ -174,24 +169,21 @@ def _camera(table: Table) -> CameraFile:
 
 
 def _scene_camera(camera: CameraFile) -> scene.SceneCamera:
+    distortion, fiducials = camera.distortion, []
+    values = {name: prior.value for name, prior in distortion.parameters.items()}
+    family = cast(scene.Family, distortion.family)
+    for one in camera.fiducials:
+        # A corner of the frame is rendered anyway; other marks may be without a drawing.
+        is_bare = one.mark is None or isinstance(one.mark, shapes.LearnedMark | shapes.FrameCorner)
+        fiducials.append(scene.SceneFiducial(one.id, one.xy_mm, None if is_bare else scene_mark(one.mark)))
     return scene.SceneCamera(
         name=camera.name,
         frame_mm=camera.frame_mm or (0.0, 0.0),
         principal_distance_mm=camera.principal_distance_mm or 0.0,
         principal_point_mm=camera.principal_point_mm or (0.0, 0.0),
-        distortion=scene.Distortion(
-            cast(scene.Family, camera.distortion.family),
-            {name: prior.value for name, prior in camera.distortion.parameters.items()},
-            camera.distortion.r0_mm,
-            camera.distortion.decentering,
-        ),
-        fiducials=tuple(scene.SceneFiducial(one.id, one.xy_mm, _painted(one.mark)) for one in camera.fiducials),
+        distortion=scene.Distortion(family, values, distortion.r0_mm, distortion.decentering),
+        fiducials=tuple(fiducials),
     )
-
-
-def _painted(mark: shapes.Mark | shapes.LearnedMark | None) -> scene.DrawnMark | scene.ChipMark | None:
-    """Mark to be drawn; None for a corner of the frame, which is rendered anyway, and for a mark without a drawing."""
-    return None if mark is None or isinstance(mark, shapes.LearnedMark | shapes.FrameCorner) else scene_mark(mark)
 
 
 def scene_mark(mark: shapes.Mark) -> scene.DrawnMark | scene.ChipMark:

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from adjust.functional_model.lens import Prior
 from measure.marks import shapes
-from pipeline.files.camera_file import CameraFile, GivenFiducial, camera_text
+from pipeline.files.camera_file import CameraFile, camera_text
 from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_tables import UNITS_MM
 from pipeline.rendered.scene_tables import DesignSettings
@@ -88,7 +88,10 @@ def write_project(scene_file: SceneFile, out_dir: Path) -> None:
     targets = field_targets(scene_file.scene.field)
     if targets:
         write_atomically(out_dir / "points.csv", _points_csv(scene_file, targets, generator))
-    middle = _middle(scene_file.scene, targets)
+        middle = np.asarray(np.mean([target.center for target in targets], axis=0))  # of the field
+    else:  # the ground below the photographs
+        stations = [image.exterior[:2] for image in scene_file.scene.images]
+        middle = np.array([*np.mean(stations, axis=0), scene_file.scene.ground])
     write_atomically(out_dir / "images.csv", _images_csv(scene_file, middle, generator))
     write_atomically(out_dir / "project.toml", _project_text(scene_file))
     if scene_file.scene.scanner.lens is not None:
@@ -109,13 +112,6 @@ def taking_camera_yaml(scene: scenes.Scene, lens: scenes.TakingLens) -> str:
     return str(storage.releaseAndGetString())
 
 
-def _middle(scene: scenes.Scene, targets: tuple[Target, ...]) -> Array:
-    """Centre of the field; without targets, the ground below the photographs."""
-    if targets:
-        return np.asarray(np.mean([target.center for target in targets], axis=0))
-    return np.array([*np.mean([image.exterior[:2] for image in scene.images], axis=0), scene.ground])
-
-
 def _given_camera(scene_file: SceneFile, generator: np.random.Generator) -> CameraFile:
     """The true camera with errors. Free distortion parameters are given as 0."""
     camera, given = scene_file.camera, scene_file.given
@@ -127,23 +123,21 @@ def _given_camera(scene_file: SceneFile, generator: np.random.Generator) -> Came
         if prior.sigma > 0.0:
             value = 0.0 if math.isinf(prior.sigma) else float(generator.normal(prior.value, prior.sigma))
             parameters[name] = Prior(value, prior.sigma)
+    fiducials = []
+    for fiducial in camera.fiducials:
+        xy_mm, mark = np.asarray(fiducial.xy_mm) + generator.normal(0.0, given.fiducial_mm, 2), fiducial.mark
+        if isinstance(mark, shapes.Mark) and scene_file.scene.scanner.negative:
+            # The scene has the polarity of the positive, the project that of its scans.
+            mark = replace(mark, polarity=NEGATIVE[mark.polarity])
+        fiducials.append(replace(fiducial, xy_mm=_pair(xy_mm), mark=mark))
     return replace(
         camera,
         principal_distance_mm=round(float(distance), 4),
         # Without fiducials the camera frame is the comparator's, and the principal point is estimated from the points.
         principal_point_mm=_pair(point) if camera.fiducials else None,
         distortion=replace(camera.distortion, parameters=parameters),
-        fiducials=tuple(_given_fiducial(one, scene_file, generator) for one in camera.fiducials),
+        fiducials=tuple(fiducials),
     )
-
-
-def _given_fiducial(fiducial: GivenFiducial, scene_file: SceneFile, generator: np.random.Generator) -> GivenFiducial:
-    xy_mm = np.asarray(fiducial.xy_mm) + generator.normal(0.0, scene_file.given.fiducial_mm, 2)
-    mark = fiducial.mark
-    if isinstance(mark, shapes.Mark) and scene_file.scene.scanner.negative:
-        # The scene has the polarity of the positive, the project that of its scans.
-        mark = replace(mark, polarity=NEGATIVE[mark.polarity])
-    return replace(fiducial, xy_mm=_pair(xy_mm), mark=mark)
 
 
 def _pair(values: Array) -> tuple[float, float]:
@@ -152,24 +146,16 @@ def _pair(values: Array) -> tuple[float, float]:
 
 
 def _points_csv(scene_file: SceneFile, targets: tuple[Target, ...], generator: np.random.Generator) -> str:
-    rows = []
-    for target in targets:
-        center, sigmas = _given_point(scene_file, target, generator)
-        rows.append([target.id, *(f"{value:.6f}" for value in center), *sigmas, *(f"{n:.6f}" for n in target.normal)])
-    return _csv(("point", "X", "Y", "Z", "sX", "sY", "sZ", "nX", "nY", "nZ"), rows)
-
-
-def _given_point(
-    scene_file: SceneFile, target: Target, generator: np.random.Generator
-) -> tuple[Array, tuple[str, str, str]]:
-    given = scene_file.given
+    given, rows = scene_file.given, []
     plane, height = given.point
-    error = generator.normal(0.0, 1.0, 3) * (plane, plane, height)
-    if given.planimetry:
-        return target.center + error, (f"{plane:g}", f"{plane:g}", f"{height:g}")
-    if target.id in given.fixed_points:
-        return target.center + error * (0.0, 0.0, 1.0), ("0", "0", f"{height:g}")
-    return target.center + error, ("", "", f"{height:g}")
+    for target in targets:
+        error = generator.normal(0.0, 1.0, 3) * (plane, plane, height)
+        sigma = f"{plane:g}" if given.planimetry else ""
+        if not given.planimetry and target.id in given.fixed_points:
+            error, sigma = error * (0.0, 0.0, 1.0), "0"
+        cells = [target.id, *(f"{value:.6f}" for value in target.center + error), sigma, sigma, f"{height:g}"]
+        rows.append([*cells, *(f"{n:.6f}" for n in target.normal)])
+    return _csv(("point", "X", "Y", "Z", "sX", "sY", "sZ", "nX", "nY", "nZ"), rows)
 
 
 def _images_csv(scene_file: SceneFile, middle: Array, generator: np.random.Generator) -> str:
@@ -179,20 +165,16 @@ def _images_csv(scene_file: SceneFile, middle: Array, generator: np.random.Gener
     has_parts = any(image.part_of for image in images)
     rows, written = [], set[str]()
     for image in images:
-        exterior = _given_exterior(scene_file, image, middle, generator) if image.frame not in written else [""] * 6
-        written.add(image.frame)
+        exterior = [""] * 6
+        if image.frame not in written:
+            station = np.asarray(image.exterior[:3])
+            spread = scene_file.given.position * float(np.linalg.norm(station - middle))
+            station = station + generator.normal(0.0, 1.0, 3) * spread
+            angles = np.rad2deg(image.exterior[3:]) + generator.normal(0.0, scene_file.given.angle_deg, 3)
+            exterior = [f"{value:.4f}" for value in (*station, *angles)]
+            written.add(image.frame)
         rows.append([image.name, *exterior, *([image.part_of] if has_parts else [])])
     return _csv([*columns, *(["part_of"] if has_parts else [])], rows)
-
-
-def _given_exterior(
-    scene_file: SceneFile, image: scenes.SceneImage, middle: Array, generator: np.random.Generator
-) -> list[str]:
-    station = np.asarray(image.exterior[:3])
-    spread = scene_file.given.position * float(np.linalg.norm(station - middle))
-    station = station + generator.normal(0.0, 1.0, 3) * spread
-    angles = np.rad2deg(image.exterior[3:]) + generator.normal(0.0, scene_file.given.angle_deg, 3)
-    return [f"{value:.4f}" for value in (*station, *angles)]
 
 
 def _csv(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -155,7 +155,6 @@ class DesignSettings:
         return named.get(image) or named.get("")
 
 
-_Triple = tuple[float, float, float]
 _Count = Annotated[int, models.whole(least=1)]
 _BoardCount = Annotated[int, models.whole(least=2)]
 
@@ -165,9 +164,9 @@ class _Plane(ABC):
     """Targets from a number on: a centre, steps right and up, and a relief: the largest distance from the plane."""
 
     first: int
-    center: _Triple = (0.0, 0.0, 0.0)
-    right: _Triple
-    up: _Triple
+    center: Triple = (0.0, 0.0, 0.0)
+    right: Triple
+    up: Triple
     relief: models.NotNegative = 0.0
 
     def __post_init__(self) -> None:
@@ -220,8 +219,8 @@ class _Scatter(_Plane):
 @models.table_model
 class _Target:
     id: str
-    xyz: _Triple
-    normal: _Triple = (0.0, 0.0, 1.0)
+    xyz: Triple
+    normal: Triple = (0.0, 0.0, 1.0)
 
 
 @models.table_model

@@ -18,7 +18,7 @@ from pipeline.cli import DONE, LOOK
 from pipeline.exchange.saved_cameras import save_cameras
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.library import MARK_KINDS, CameraSizes, camera_template
-from pipeline.measuring.target_identification import misplaced_principal_point
+from pipeline.measuring.scan_measurement import misplaced_principal_point
 from pipeline.rendered.scene_file import render_project
 from pipeline.results.adjustment_record import Quantity
 from pipeline.results.measured_record import MeasuredScan
