@@ -185,15 +185,15 @@ def _misnamed(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, 
 
 def _notes(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, ...]:
     """Notes on an assumed pixel pitch, and on given points that no image shows."""
+    observed = {mark.point for mark in marks if mark.status.is_observation and mark.kind not in ON_FILM}
+    lost = [id for id in project.object_points if id not in observed] if project.given_points is not None else []
     notes, path = [], project.comparator
     if project.pitch_um is None and not project.scans and path.exists() and has_pixels_alone(path):
         notes.append(
             f"Nothing says how large a pixel is: {ASSUMED_PITCH_UM:g} µm are assumed. Of all in mm and µm only ratios "
             "count; set pitch_um in project.toml to have them."
         )
-    observed = {mark.point for mark in marks if mark.status.is_observation and mark.kind not in ON_FILM}
-    lost = [id for id in project.object_points if id not in observed]
-    if project.given_points is not None and lost:  # an effect of large patterns, but also of a wrong point number
+    if lost:  # an effect of large patterns, but also of a wrong point number
         notes.append(
             f"Given but measured in no image: {'point' if len(lost) == 1 else f'{len(lost)} points,'} {listed(lost)}. "
             f"If an image shows {'it' if len(lost) == 1 else 'one'}, look for a wrong point number or coordinate."

@@ -307,13 +307,14 @@ def _cameras(
 def _points(
     given: Mapping[str, ObjectPoint], ties: TieSettings | None, marks: Sequence[ComparatorPoint]
 ) -> tuple[ObjectPoint, ...]:
-    """Object points that are observed: as given, of the board, or unknown."""
+    """Object points that are observed: as given, of the board, or unknown; natural ones may have a given height."""
     kinds = {mark.point: mark.kind for mark in reversed(marks) if mark.kind not in ON_FILM}
-    unknown = partial(ObjectPoint, X=None, Y=None, Z=None)
-    return tuple(
-        given.get(id) or (ties.point(id) if ties is not None and kinds[id] == "tie" else unknown(id))
-        for id in dict.fromkeys(mark.point for mark in marks if mark.point in kinds)
-    )
+    tie_height = None if ties is None or ties.height is None else Prior(ties.height, ties.height_sigma or 0.0)
+    points = []
+    for id in dict.fromkeys(mark.point for mark in marks if mark.point in kinds):
+        height = tie_height if kinds[id] == "tie" else None
+        points.append(given.get(id) or ObjectPoint(id, None, None, height))
+    return tuple(points)
 
 
 def _boards(project: Project) -> tuple[Board, ...]:

@@ -23,10 +23,10 @@ def rotate_to_sensor(project: Project, marks: Sequence[ComparatorPoint]) -> list
     for mark in marks:
         if mark.xy_mm is not None and project.turned_deg(mark.image):
             turned_deg, last_mm = picture_turn(project, mark.image)
+            mark = replace(mark, xy_mm=turned_back(mark.xy_mm, turned_deg, last_mm))
             if turned_deg != 180:
                 sigma_mm = None if mark.sigma_mm is None else mark.sigma_mm[::-1].copy()
                 mark = replace(mark, sigma_mm=sigma_mm, rho=-mark.rho)
-            mark = replace(mark, xy_mm=turned_back(mark.xy_mm, turned_deg, last_mm))
         rotated.append(mark)
     return rotated
 

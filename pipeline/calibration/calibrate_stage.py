@@ -126,25 +126,19 @@ class Calibration(PlottedResult):
 
     def print(self, console: Console) -> None:
         """Print the cameras, then the problems, then the files except the report."""
-        for camera in self.cameras:
-            camera.print(console)
+        for each in self.cameras:
+            each.print(console)
         console.print("Needs a look." if self.needs_review else "Good: every test was passed.", highlight=False)
-        for line in self._lines():
+        lines = []
+        if len(self.cameras) + len(self.not_calibrated) > 1:
+            lines.append("Pictures of other sizes or focal lengths are taken for other cameras'.")
+        lines += [f"- {name} cannot be read: {why}" for name, why in self.unreadable.items()]
+        lines += [f"- {camera} is not calibrated: {why}" for camera, why in self.not_calibrated.items()]
+        for problem in self.summary.verdict.problems:
+            lines += [f"- {problem.cause} {problem.detail}".rstrip(), f"  {problem.remedy}".rstrip()]
+        lines += [str(file) for file in self.files if file != self.report]
+        for line in lines:
             console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-    def _lines(self) -> list[str]:
-        several = len(self.cameras) + len(self.not_calibrated) > 1
-        return [
-            *(["Pictures of other sizes or focal lengths are taken for other cameras'."] if several else []),
-            *(f"- {name} cannot be read: {why}" for name, why in self.unreadable.items()),
-            *(f"- {camera} is not calibrated: {why}" for camera, why in self.not_calibrated.items()),
-            *(
-                line
-                for each in self.summary.verdict.problems
-                for line in (f"- {each.cause} {each.detail}".rstrip(), f"  {each.remedy}".rstrip())
-            ),
-            *(str(file) for file in self.files if file != self.report),
-        ]
 
 
 def _calibrated(

@@ -4,8 +4,6 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
-from adjust.functional_model.lens import Prior
-from adjust.problem.network import ObjectPoint
 from measure.boards import specs
 from measure.boards.specs import BoardSpec
 from measure.marks.shapes import Polarity
@@ -247,8 +245,3 @@ class TieSettings:
     def options(self) -> TieOptions:
         given = {"wanted": self.wanted, "images": self.images}
         return TieOptions(**{key: value for key, value in given.items() if value is not None})
-
-    def point(self, id: str) -> ObjectPoint:
-        """Natural point as an object point: unknown except for its height, where that is given."""
-        height = None if self.height is None else Prior(self.height, self.height_sigma or 0.0)
-        return ObjectPoint(id, None, None, height)

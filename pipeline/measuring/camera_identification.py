@@ -73,34 +73,31 @@ def add_plates(
     plates = [parse_plate(scan.frame.writing or ()) for scan in scans]
     numbers = sorted({plate["camera_number"] for plate in plates if "camera_number" in plate})
     known = {other.number: name for name, other in cameras.items() if other.number}
-    return [_add_plate(camera, scan, plate, numbers, known) for scan, plate in zip(scans, plates, strict=True)]
-
-
-def _add_plate(
-    camera: CameraFile, scan: MeasuredScan, plate: dict[str, str], numbers: Sequence[str], known: Mapping[str, str]
-) -> MeasuredScan:
-    problems, notes = [], []
-    against = contradictions(camera, plate)
-    if against:
-        named = known.get(plate.get("camera_number", ""), "")
-        its_own = f"the camera {named}, whose number that is," if named else "its own camera"
-        problems.append(
-            f"the plate in the picture is not of {camera.name}: {' and '.join(against)}. Give this scan {its_own} by "
-            "the column camera of images.csv, or see in frames.csv whether the plate is misread."
-        )
-    if len(numbers) > 1 and "camera_number" in plate and not camera.number:
-        problems.append(
-            f"the scans of {camera.name} show plates of several cameras, Nr {', '.join(numbers)}: each has a "
-            "calibration of its own. Give each a camera file with its number, by the column camera of images.csv, or "
-            "see in frames.csv whether a number is misread."
-        )
-    if "principal_distance_mm" in plate and not against and camera.principal_distance_mm:
-        number = f" (Nr {plate['camera_number']})" if "camera_number" in plate else ""
-        notes.append(
-            f"The camera's plate{number} says a principal distance of {plate['principal_distance_mm']} mm, the "
-            f"camera file {camera.principal_distance_mm:g} mm. Nothing is changed by it."
-        )
-    return scan.changed(None, [Reason(each, Code.PLATE) for each in problems], notes)
+    added = []
+    for scan, plate in zip(scans, plates, strict=True):
+        problems, notes = [], []
+        against = contradictions(camera, plate)
+        if against:
+            named = known.get(plate.get("camera_number", ""), "")
+            its_own = f"the camera {named}, whose number that is," if named else "its own camera"
+            problems.append(
+                f"the plate in the picture is not of {camera.name}: {' and '.join(against)}. Give this scan {its_own} "
+                "by the column camera of images.csv, or see in frames.csv whether the plate is misread."
+            )
+        if len(numbers) > 1 and "camera_number" in plate and not camera.number:
+            problems.append(
+                f"the scans of {camera.name} show plates of several cameras, Nr {', '.join(numbers)}: each has a "
+                "calibration of its own. Give each a camera file with its number, by the column camera of images.csv, "
+                "or see in frames.csv whether a number is misread."
+            )
+        if "principal_distance_mm" in plate and not against and camera.principal_distance_mm:
+            number = f" (Nr {plate['camera_number']})" if "camera_number" in plate else ""
+            notes.append(
+                f"The camera's plate{number} says a principal distance of {plate['principal_distance_mm']} mm, the "
+                f"camera file {camera.principal_distance_mm:g} mm. Nothing is changed by it."
+            )
+        added.append(scan.changed(None, [Reason(each, Code.PLATE) for each in problems], notes))
+    return added
 
 
 # Cameras with solid marks (wings, notches, arrows) that resemble those of others: a scan hardly distinguishes them.

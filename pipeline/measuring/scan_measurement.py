@@ -188,7 +188,7 @@ def _fiducials(options: ScanOptions, scan: Scan) -> FrameMeasurement:
             "needs it, for its size says nothing of the pitch."
         )
     measured = measure_fiducials(scan, layout, pitch, options.fiducials)
-    problems = [second_frame(scan, layout, measured, options.fiducials)]
+    problems: list[Reason | None] = [second_frame(scan, layout, measured, options.fiducials)]
     if pitch is not None:
         source = "the project" if options.pitch_um is not None else "the scan's file"
         problems.append(pitch_problem(measured, layout, pitch, source))

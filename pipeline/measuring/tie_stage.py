@@ -34,7 +34,7 @@ _NO_FRAME = Reason(
 )
 
 
-def _add_joins(
+def add_joins(
     project: Project, scans: Sequence[MeasuredScan], count: Count, workers: Executor | None
 ) -> tuple[MeasuredScan, ...]:
     """Add joins to the partial scans of each frame.
@@ -181,7 +181,7 @@ def check_tie_names(project: Project) -> None:
         )
 
 
-def _add_ties(
+def add_ties(
     project: Project, settings: TieSettings, scans: Sequence[MeasuredScan], count: Count, workers: Executor | None
 ) -> tuple[MeasuredScan, ...]:
     """Measure natural tie points and add them to the scans; not where a camera has fiducials and too few of them were
@@ -212,9 +212,9 @@ def tie_scans(
     together = check_sheet(project, [scan for scan in scans if not scan.failure])
     if project.has_parts:
         with reporter.stage("joining parts of frame") as count:
-            together = _add_joins(project, together, count, executor)
+            together = add_joins(project, together, count, executor)
     if project.ties is not None:
         with reporter.stage("natural points of scan") as count:
-            together = _add_ties(project, project.ties, together, count, executor)
+            together = add_ties(project, project.ties, together, count, executor)
     by_image = {scan.frame.image: scan for scan in together}
     return tuple(by_image.get(scan.frame.image, scan) for scan in scans)

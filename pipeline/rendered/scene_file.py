@@ -173,9 +173,10 @@ def _scene_camera(camera: CameraFile) -> scene.SceneCamera:
     values = {name: prior.value for name, prior in distortion.parameters.items()}
     family = cast(scene.Family, distortion.family)
     for one in camera.fiducials:
-        # A corner of the frame is rendered anyway; other marks may be without a drawing.
-        is_bare = one.mark is None or isinstance(one.mark, shapes.LearnedMark | shapes.FrameCorner)
-        fiducials.append(scene.SceneFiducial(one.id, one.xy_mm, None if is_bare else scene_mark(one.mark)))
+        drawn = None  # of a corner of the frame, which is rendered anyway, and of a mark without a drawing
+        if one.mark is not None and not isinstance(one.mark, shapes.LearnedMark | shapes.FrameCorner):
+            drawn = scene_mark(one.mark)
+        fiducials.append(scene.SceneFiducial(one.id, one.xy_mm, drawn))
     return scene.SceneCamera(
         name=camera.name,
         frame_mm=camera.frame_mm or (0.0, 0.0),
