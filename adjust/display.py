@@ -1,8 +1,8 @@
 """Display of results: plots of a camera, which need Matplotlib, and tables for pandas, where it is installed."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,16 +10,10 @@ import numpy as np
 from adjust.array_types import Array, Mask
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Lens
-from adjust.problem.camera import Camera
-from adjust.problem.estimates import Estimates, adjusted_lens, observed_places
-from adjust.problem.observations import Observations
-from adjust.problem.parameter import Parameter
 from adjust.quality.lens_uncertainty import distortion_curves, is_defined_over_frame
-from adjust.quality.run import Residuals
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.colors import LogNorm
 
 BAND = 1.959964  # in standard deviations, half width of the 95 % band
 LONGEST = 0.08  # length of the longest vectors, fraction of the longer side of the image
@@ -69,7 +63,7 @@ class CameraPlots:
         places, vectors = self._places(self.places_mm), self._lengths(self.vectors_mm)
         sizes = np.hypot(*vectors.T)
         longest = max(float(np.percentile(sizes, 99)) if len(sizes) else 0.0, 1e-9)
-        to_vector = longest / (LONGEST * self._longer_side)
+        to_vector = longest / (LONGEST * float(np.ptp(self._places(self.corners_mm), axis=0).max()))
         for rows, color, label in ((~self.is_fiducial, TARGET, "targets"), (self.is_fiducial, FIDUCIAL, "fiducials")):
             if rows.any():
                 style: dict[str, Any] = {"color": color, "label": label, "width": 0.0025}
@@ -106,11 +100,12 @@ class CameraPlots:
             axes.fill_between(
                 radius, um * (value - BAND * sigma), um * (value + BAND * sigma), color=color, alpha=0.25, linewidth=0
             )
-        observed = self._observed_radius_mm * self._per_mm
+        targets_mm = self.places_mm[~self.is_fiducial] - self.lens.interior[1:]
+        observed = float(np.hypot(*targets_mm.T).max(initial=0.0)) * self._per_mm
         if observed < radius[-1]:
             axes.axvspan(observed, radius[-1], color="#dddddd", zorder=0, label="no targets")
         axes.set_xlim(0.0, radius[-1])
-        axes.set_xlabel(f"radius from the principal point ({self._long_unit})")
+        axes.set_xlabel(f"radius from the principal point ({'mm' if self.pixel_mm is None else 'px'})")
         axes.set_ylabel(f"displacement ({self._short_unit})")
         axes.grid(alpha=0.3)
         axes.legend(fontsize="small")
@@ -127,18 +122,15 @@ class CameraPlots:
         """
         places_mm, sigma_mm = self.uncertainty(distance)
         axes = self._frame(axes)
+        from matplotlib.colors import LogNorm
+
         places, sigma = self._places(places_mm), sigma_mm * self._lengths_per_mm
         levels = contour_levels(sigma)
-        filled = axes.contourf(
-            places[..., 0],
-            places[..., 1],
-            sigma,
-            levels=levels,
-            cmap="viridis_r",
-            norm=_log_norm(levels),
-            extend="both",
-        )
-        lines = axes.contour(places[..., 0], places[..., 1], sigma, levels=levels, colors="black", linewidths=0.6)
+        is_wide = len(levels) > 1 and levels[-1] > 3.0 * levels[0]
+        norm = LogNorm(levels[0], levels[-1]) if is_wide else None
+        x, y = np.moveaxis(places, -1, 0)
+        filled = axes.contourf(x, y, sigma, levels=levels, cmap="viridis_r", norm=norm, extend="both")
+        lines = axes.contour(x, y, sigma, levels=levels, colors="black", linewidths=0.6)
         low, high = np.sort(self._places(self.corners_mm), axis=0)
         for label in axes.clabel(lines, fmt="%g", fontsize=8):
             inward = np.minimum(label.get_position() - low, high - label.get_position())
@@ -194,15 +186,6 @@ class CameraPlots:
         return vectors_mm * self._lengths_per_mm * ([1.0, 1.0] if self.pixel_mm is None else [1.0, -1.0])
 
     @property
-    def _longer_side(self) -> float:
-        return float(np.ptp(self._places(self.corners_mm), axis=0).max())
-
-    @property
-    def _observed_radius_mm(self) -> float:
-        targets = self.places_mm[~self.is_fiducial] - self.lens.interior[1:]
-        return float(np.hypot(*targets.T).max(initial=0.0))
-
-    @property
     def _per_mm(self) -> float:
         return 1.0 if self.pixel_mm is None else 1.0 / self.pixel_mm
 
@@ -212,39 +195,8 @@ class CameraPlots:
         return 1e3 if self.pixel_mm is None else 1.0 / self.pixel_mm
 
     @property
-    def _long_unit(self) -> str:
-        return "mm" if self.pixel_mm is None else "px"
-
-    @property
     def _short_unit(self) -> str:
         return "µm" if self.pixel_mm is None else "px"
-
-
-def adjusted_camera_plots(
-    estimates: Estimates,
-    covariance_of: Callable[[Sequence[Parameter]], Array],
-    camera: Camera,
-    v_mm: Array,
-    uncertainty: Callable[[float], tuple[Array, Array]],
-    pixel_mm: float | None = None,
-) -> CameraPlots:
-    """Collect the data for the plots of a camera; v_mm (n, 2): residuals in the comparator."""
-    observations = estimates.network.observations
-    rows, observed = observed_places(estimates, camera.name, observations.xy_mm)
-    _, adjusted = observed_places(estimates, camera.name, observations.xy_mm + v_mm)
-    lens = adjusted_lens(estimates, camera.name)
-    keys = [Parameter.interior(camera.name, each) for each in lens.quantities]
-    return CameraPlots(
-        name=camera.name,
-        lens=replace(lens, covariance=covariance_of(keys)),
-        places_mm=observed,
-        vectors_mm=adjusted - observed,
-        is_fiducial=observations.is_fiducial[rows],
-        images=sum(image.camera == camera.name for image in estimates.network.images),
-        corners_mm=np.array(camera.frame_corners(observed) or (observed.min(axis=0), observed.max(axis=0))),
-        uncertainty=uncertainty,
-        pixel_mm=pixel_mm,
-    )
 
 
 class PlottedResult(ABC):
@@ -310,13 +262,6 @@ def _axes(axes: "Axes | None", size_in: tuple[float, float]) -> "Axes":
     return plt.subplots(figsize=size_in, layout="constrained")[1]
 
 
-def _log_norm(levels: list[float]) -> "LogNorm | None":
-    """Logarithmic colour scale where the levels span a large ratio."""
-    from matplotlib.colors import LogNorm
-
-    return LogNorm(levels[0], levels[-1]) if len(levels) > 1 and levels[-1] > 3.0 * levels[0] else None
-
-
 def data_frame(columns: dict[str, Any]) -> Any:
     """Make a pandas.DataFrame. Raises ImportError without pandas."""
     try:
@@ -324,24 +269,3 @@ def data_frame(columns: dict[str, Any]) -> Any:
     except ImportError:
         raise ImportError("Tables need pandas, which this installation lacks. Install: pip install pandas.") from None
     return pd.DataFrame(columns)
-
-
-def parameter_columns(estimates: Estimates) -> dict[str, Any]:
-    """Columns of a table with one row per quantity."""
-    keys = estimates.parameters
-    return {
-        "kind": [key.kind for key in keys],
-        "owner": [key.owner for key in keys],
-        "id": [key.id for key in keys],
-        "quantity": [key.quantity for key in keys],
-        "value": estimates.values,
-        "sigma": estimates.sigma0 * np.sqrt(estimates.cofactor.variances),
-    }
-
-
-def residual_columns(observations: Observations, residuals: Residuals) -> dict[str, Any]:
-    """Columns of a table with one row per observation."""
-    columns: dict[str, Any] = {"image": observations.image, "point": observations.point, "kind": observations.kind}
-    pairs = {"{}_mm": observations.xy_mm, "v{}_um": 1e3 * residuals.v_mm, "redundancy_{}": residuals.redundancy}
-    pairs["w_{}"] = residuals.w
-    return columns | {name.format(axis): pair[:, k] for name, pair in pairs.items() for k, axis in enumerate("xy")}

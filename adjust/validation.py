@@ -5,12 +5,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from adjust.array_types import Indices
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import fewest_marks, marks_needed
-from adjust.problem.camera import Camera
 from adjust.problem.network import Image, Network
 from adjust.problem.parameter import Parameter, description
 
@@ -36,7 +34,6 @@ def validate_plan(network: Network) -> None:
         _board_faults,
         _observation_faults,
         _distance_faults,
-        _fiducial_distance_faults,
         _calibration_faults,
         _value_faults,
         _part_faults,
@@ -154,16 +151,13 @@ def _distance_faults(network: Network) -> Faults:
             if end in network.point_by_id and end not in network.observed_points:
                 yield f"{what}: no image shows the point {end}. Measure it, or leave the distance out."
         yield from _length_faults(what, each.start == each.end, each.value, each.sigma)
-
-
-def _fiducial_distance_faults(network: Network) -> Faults:
     for camera in network.cameras:
-        for each in camera.distances:
-            what = f"the distance from fiducial {each.start} to {each.end} of camera {camera.name}"
-            for end in (each.start, each.end):
+        for measured in camera.distances:
+            what = f"the distance from fiducial {measured.start} to {measured.end} of camera {camera.name}"
+            for end in (measured.start, measured.end):
                 if end not in camera.fiducials:
                     yield f"{what}: the camera has no fiducial {end}. Correct the name."
-            yield from _length_faults(what, each.start == each.end, each.value_mm, each.sigma_mm)
+            yield from _length_faults(what, measured.start == measured.end, measured.value_mm, measured.sigma_mm)
 
 
 def _length_faults(what: str, is_closed: bool, value: float, sigma: float) -> Faults:
@@ -179,8 +173,14 @@ def _length_faults(what: str, is_closed: bool, value: float, sigma: float) -> Fa
 
 
 def _calibration_faults(network: Network) -> Faults:
-    sigmas = {parameter: sigma for camera in network.cameras for parameter, sigma in _camera_sigmas(camera)}
-    given: set[Parameter] = set()
+    priors, given = dict[Parameter, Prior | None](), set[Parameter]()
+    for camera in network.cameras:
+        interior = {"c": camera.principal_distance_mm, "x0": camera.x0_mm, "y0": camera.y0_mm}
+        named: dict[str, Prior | None] = {**interior, **camera.distortion.parameters}
+        priors |= {Parameter.interior(camera.name, name): prior for name, prior in named.items()}
+        for id_, mark in camera.fiducials.items():
+            priors |= {Parameter.fiducial(camera.name, id_, axis): getattr(mark, f"{axis}_mm") for axis in "xy"}
+    sigmas = {parameter: np.inf if prior is None else prior.sigma for parameter, prior in priors.items()}
     for each in network.calibrations:
         for key in each.parameters:
             if key not in sigmas:
@@ -205,17 +205,6 @@ def _calibration_faults(network: Network) -> Faults:
                 f"positive definite: some of these quantities were fixed, or are not separately estimable. Fix them "
                 f"here too."
             )
-
-
-def _camera_sigmas(camera: Camera) -> Iterator[tuple[Parameter, float]]:
-    """Quantities of a camera with the standard deviations of their own priors."""
-    interior = {"c": camera.principal_distance_mm, "x0": camera.x0_mm, "y0": camera.y0_mm}
-    named: dict[str, Prior | None] = {**interior, **camera.distortion.parameters}
-    priors = {Parameter.interior(camera.name, name): prior for name, prior in named.items()}
-    for id_, mark in camera.fiducials.items():
-        priors |= {Parameter.fiducial(camera.name, id_, axis): getattr(mark, f"{axis}_mm") for axis in "xy"}
-    for parameter, prior in priors.items():
-        yield parameter, np.inf if prior is None else prior.sigma
 
 
 def _value_faults(network: Network) -> Faults:
@@ -305,36 +294,29 @@ def _part_faults(network: Network) -> Faults:
 
 
 def _image_faults(network: Network) -> Faults:
-    """Frames with too few marks."""
-    frames = {image.frame: image for image in network.images}
-    for (frame, image), shown in zip(frames.items(), _mark_counts(network).tolist()[: len(frames)], strict=True):
-        yield from _mark_faults(frame, image, *shown)
-
-
-def _mark_counts(network: Network) -> Indices:
-    """(frames, 2) number of object points and of fiducials in every frame; those in several parts count once."""
-    observations, frames = network.observations, network.frame_numbers[network.image_numbers]
+    """Frames with too few object points or fiducials; those in several parts of a frame count once."""
+    observations, of_mark = network.observations, network.frame_numbers[network.image_numbers]
     names, points = observations.numbered_points
     kinds = observations.has_kind("fiducial") + 2 * observations.has_kind("join")  # all others are object points
-    marks = np.sort((frames * 3 + kinds) * len(names) + points)
+    marks = np.sort((of_mark * 3 + kinds) * len(names) + points)
     marks = marks[np.diff(marks, prepend=-1) > 0] // len(names)
-    return np.bincount(marks, minlength=3 * len(network.images)).reshape(-1, 3)[:, :2]
-
-
-def _mark_faults(frame: str, image: Image, targets: int, fiducials: int) -> Faults:
-    needed = marks_needed(image.transformation)
-    fewest = fewest_marks(image.transformation) if targets else needed
-    if fiducials < fewest:
-        alone = f", {needed} where its targets tell nothing of it" if needed > fewest else ""
-        yield (
-            f"image {frame} shows {fiducials} fiducial marks; its {image.transformation} transformation needs "
-            f"{fewest}{alone}. Measure more of them, choose a transformation that needs fewer, or leave the image out."
-        )
-    if not targets and not fiducials:
-        yield f"image {frame} shows neither fiducial marks nor object points. Leave the image out."
-    if 0 < targets < TARGETS_NEEDED and not image.is_observed:
-        yield (
-            f"image {frame} shows {targets} object points; its exterior orientation needs {TARGETS_NEEDED}. "
-            f"Measure more targets in it, give its orientation with standard deviations, or leave its targets out: its "
-            f"fiducial marks alone give its film transformation."
-        )
+    counts = np.bincount(marks, minlength=3 * len(network.images)).reshape(-1, 3).tolist()
+    frames = {image.frame: image for image in network.images}
+    for (frame, image), (targets, fiducials, _) in zip(frames.items(), counts[: len(frames)], strict=True):
+        needed = marks_needed(image.transformation)
+        fewest = fewest_marks(image.transformation) if targets else needed
+        if fiducials < fewest:
+            alone = f", {needed} where its targets tell nothing of it" if needed > fewest else ""
+            yield (
+                f"image {frame} shows {fiducials} fiducial marks; its {image.transformation} transformation needs "
+                f"{fewest}{alone}. Measure more of them, choose a transformation that needs fewer, or leave the image "
+                "out."
+            )
+        if not targets and not fiducials:
+            yield f"image {frame} shows neither fiducial marks nor object points. Leave the image out."
+        if 0 < targets < TARGETS_NEEDED and not image.is_observed:
+            yield (
+                f"image {frame} shows {targets} object points; its exterior orientation needs {TARGETS_NEEDED}. "
+                "Measure more targets in it, give its orientation with standard deviations, or leave its targets out: "
+                "its fiducial marks alone give its film transformation."
+            )

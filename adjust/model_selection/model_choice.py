@@ -14,6 +14,7 @@ testing in linear models, 1999, chapter 4.2; K. P. Burnham and D. R. Anderson, M
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import permutations
 
@@ -105,8 +106,16 @@ class Model:
             image if image.transformation == "none" else replace(image, transformation=self.transformation)
             for image in network.images
         )
-        calibrations = tuple(_calibration_without_distortion(each, network) for each in network.calibrations)
-        changed = replace(network, cameras=tuple(cameras), images=images, calibrations=calibrations)
+        # Earlier calibrations go without the distortion, since it differs between candidates.
+        dropped = {
+            Parameter.interior(each.name, name) for each in network.cameras for name in each.distortion.parameters
+        }
+        calibrations = []
+        for each in network.calibrations:
+            kept = [i for i, parameter in enumerate(each.parameters) if parameter not in dropped]
+            covariance = each.covariance[np.ix_(kept, kept)]
+            calibrations.append(Calibration(tuple(each.parameters[i] for i in kept), each.values[kept], covariance))
+        changed = replace(network, cameras=tuple(cameras), images=images, calibrations=tuple(calibrations))
         return network_with_terms(changed, dict(self.bends))
 
 
@@ -199,19 +208,10 @@ def choose(
     half_mm = half_mm or {}
     given = given_model(own.network)
     fits = _Fits(weighted_network(own), options.plain, half_mm, progress, {given.transformation: own})
-    chosen, untold = _chosen(fits, given, with_sets=all(camera.name in half_mm for camera in own.network.cameras))
-    candidates = tuple(fits.done.values())
-    sentences = (*reasons(candidates, chosen), *untold)
-    return Choice(given, candidates, nested_tests(candidates), chosen, verdict(given, chosen), sentences)
-
-
-def _chosen(fits: "_Fits", given: Model, with_sets: bool) -> tuple[Candidate | None, tuple[str, ...]]:
-    """Select distortion, scanner terms and transformation in turn until none changes."""
-    # Also returns remarks on scanner terms that are not estimable. The scanner terms come before the transformation,
-    # since a richer transformation could absorb them.
-    film, bends = given.transformation, Bends()
-    chosen: Candidate | None = None
-    untold: tuple[str, ...] = ()
+    with_sets = all(camera.name in half_mm for camera in own.network.cameras)
+    # Distortion, scanner terms and transformation are selected in turn until none changes. The scanner terms come
+    # before the transformation, since a richer transformation could absorb them.
+    film, bends, untold = given.transformation, Bends(), tuple[str, ...]()
     for _ in range(ROUNDS):
         chosen = fits.simplest(replace(each, bends=bends) for each in lenses(fits.network, film, with_sets))
         if chosen is None:
@@ -226,7 +226,9 @@ def _chosen(fits: "_Fits", given: Model, with_sets: bool) -> tuple[Candidate | N
         if chosen is None or (chosen.model.transformation, chosen.model.bends) == (film, bends):
             break
         film, bends = chosen.model.transformation, chosen.model.bends
-    return chosen, untold
+    candidates = tuple(fits.done.values())
+    sentences = (*reasons(candidates, chosen), *untold)
+    return Choice(given, candidates, nested_tests(candidates), chosen, verdict(given, chosen), sentences)
 
 
 def weighted_network(own: Adjustment) -> Network:
@@ -272,9 +274,8 @@ class _Fits:
         return given_model(bent).bends, remarks
 
     def _candidate(self, model: Model) -> Candidate:
-        near = self.starts.get(model.transformation)
         try:
-            result = self._from(model, None if near is None or not near.converged else near)
+            result = self._adjust(model)
         except AdjustmentError as error:
             return Candidate(model, str(error))
         if result.singular:
@@ -296,16 +297,14 @@ class _Fits:
             result.warnings,
         )
 
-    def _from(self, model: Model, near: Adjustment | None) -> Adjustment:
+    def _adjust(self, model: Model) -> Adjustment:
         """Adjust from the values of a similar model, or where that fails from the network's own approximations."""
-        network = model.build_network(self.network, self.half_mm)
-        if near is not None:
-            try:
+        network, near = model.build_network(self.network, self.half_mm), self.starts.get(model.transformation)
+        if near is not None and near.converged:
+            with suppress(AdjustmentError):
                 result = adjust(network, _start(model, near), self.options)
-            except AdjustmentError:
-                result = None
-            if result is not None and (result.converged or result.singular):
-                return result
+                if result.converged or result.singular:
+                    return result
         return adjust(network, approximate(held_as_known(network, self.options.datum_coordinates)), self.options)
 
 
@@ -358,10 +357,12 @@ def cross_validate(adjustment: Adjustment, options: Options) -> CrossValidation 
 
 def left_out_rows(network: Network, options: Options) -> Iterator[Indices]:
     """Rows of the rays that are left out together and predicted, see `cross_validate`."""
-    names, number = network.observations.numbered_points
-    given = network.coordinates(firm=True)
+    observations, given = network.observations, network.coordinates(firm=True)
+    names, number = observations.numbered_points
     for points in folds(network, options):
-        rows = _rows(network, points)
+        named = np.flatnonzero(np.isin(observations.point, list(points)) & ~observations.is_fiducial)
+        in_order = sorted(named, key=lambda row: (observations.point[row], observations.image[row]))
+        rows = np.array(in_order, dtype=np.intp)
         point = number[rows]
         is_known = ~np.array([np.isnan(given[names[i]]).any() for i in point], dtype=bool)
         _, first, which = np.unique(point, return_index=True, return_inverse=True)
@@ -373,13 +374,6 @@ def left_out_rows(network: Network, options: Options) -> Iterator[Indices]:
                 yield chosen
 
 
-def _rows(network: Network, points: frozenset[str]) -> Indices:
-    """Rows of some object points, sorted by point and image."""
-    observations = network.observations
-    named = np.flatnonzero(np.isin(observations.point, list(points)) & ~observations.is_fiducial)
-    return np.array(sorted(named, key=lambda row: (observations.point[row], observations.image[row])), dtype=np.intp)
-
-
 def _correlated(result: Adjustment) -> tuple[tuple[str, str, float], ...]:
     """Pairs of highly correlated interior parameters of a camera, highest first."""
     several = len(result.network.cameras) > 1
@@ -389,18 +383,6 @@ def _correlated(result: Adjustment) -> tuple[tuple[str, str, float], ...]:
             first, second = (one.label if several else one.quantity for one in each.parameters)
             pairs.append((first, second, each.rho))
     return tuple(pairs)
-
-
-def _calibration_without_distortion(calibration: Calibration, network: Network) -> Calibration:
-    """Drop the distortion from an earlier calibration, since it differs between candidates."""
-    cameras = network.cameras
-    distortion = {Parameter.interior(camera.name, name) for camera in cameras for name in camera.distortion.parameters}
-    kept = [i for i, parameter in enumerate(calibration.parameters) if parameter not in distortion]
-    return Calibration(
-        tuple(calibration.parameters[i] for i in kept),
-        calibration.values[kept],
-        calibration.covariance[np.ix_(kept, kept)],
-    )
 
 
 def given_model(network: Network) -> Model:
@@ -546,10 +528,3 @@ def _reason(other: Candidate, chosen: Candidate) -> str:
 def _f_words(test: Nested) -> str:
     chance = f"p = {test.p:.3f}" if test.p >= 0.001 else "p < 0.001"
     return f"F({test.degrees[0]}, {test.degrees[1]}) = {test.f:.3g}, {chance}"
-
-
-def _prediction(other: Candidate, chosen: Candidate) -> str:
-    a, b = other.cross_validation, chosen.cross_validation
-    if a is None or b is None:
-        return "it was not cross-validated" if a is None else "the chosen one was not cross-validated"
-    return f"it predicts points left out to {a.rms_um:.2f} µm, the chosen one to {b.rms_um:.2f} µm"

@@ -57,7 +57,7 @@ def choose_bends(
 
     adjusted: adjusts a network; called once, with all candidates. sigma_mm: as in `bent_network`.
     """
-    films = _films(network)
+    films = {image.transformation for image in network.images if image.scanner}
     smooth, carriage = smooth_terms(films), carriage_terms(films)
     candidates = (*smooth, *carriage)
     trial = adjusted(network_with_terms(network, dict.fromkeys(_scanners(network), candidates), WEAK_MM))
@@ -70,20 +70,22 @@ def choose_bends(
         return network_with_terms(network, {}), (remark,)
     chosen: dict[str, tuple[str, ...]] = {}
     remarks: list[str] = []
+    cameras = trial.network.cameras
+    distortion = [Parameter.interior(camera.name, name) for camera in cameras for name in camera.distortion.parameters]
+    distortion = [key for key in distortion if trial.has(key) and trial.sigma(key) > 0.0]
     for scanner in trial.network.scanners:
-        equations = _equations(trial, scanner)
-        chosen[scanner.name] = _needed(equations, smooth)
-        undetermined_terms = [term for term in equations.undetermined_terms(chosen[scanner.name]) if term in smooth]
+        equations, taken = _equations(trial, scanner), list[str]()
+        for among in (smooth, carriage):
+            while (best := equations.next(taken, among)) is not None and best[1] < LEVEL / len(candidates):
+                taken.append(best[0])
+        chosen[scanner.name] = needed = tuple(term for term in candidates if term in taken)
+        undetermined_terms = [term for term in equations.undetermined_terms(needed) if term in smooth]
+        with_lens = _equations(trial, scanner, distortion).undetermined_terms(needed)
         poses = scan_poses(trial.run.problem, trial.run.end.state, scanner.name)
-        with_lens = _equations(trial, scanner, _free_distortion(trial)).undetermined_terms(chosen[scanner.name])
         remarks += undetermined_term_sentences(
             scanner.name, undetermined_terms, set(undetermined_terms) - set(with_lens), poses
         )
     return network_with_terms(network, chosen, sigma_mm), tuple(remarks)
-
-
-def _films(network: Network) -> set[str]:
-    return {image.transformation for image in network.images if image.scanner}
 
 
 def _scanners(network: Network) -> list[str]:
@@ -131,13 +133,6 @@ class _Equations:
         return determined, np.where(determined, right**2 / np.where(determined, normal, 1.0), 0.0)
 
 
-def _free_distortion(trial: Adjustment) -> list[Parameter]:
-    """Distortion parameters of all cameras that are not fixed."""
-    cameras = trial.network.cameras
-    keys = [Parameter.interior(camera.name, name) for camera in cameras for name in camera.distortion.parameters]
-    return [key for key in keys if trial.has(key) and trial.sigma(key) > 0.0]
-
-
 def _equations(trial: Adjustment, scanner: Scanner, held: Sequence[Parameter] = ()) -> _Equations:
     """Normal equations of one scanner's terms, with those of other scanners free; held: other unknowns held fixed."""
     terms = tuple(scanner.terms)
@@ -158,12 +153,3 @@ def _equations(trial: Adjustment, scanner: Scanner, held: Sequence[Parameter] = 
     return _Equations(
         terms, normal - np.eye(len(terms)) / WEAK_MM**2, right, np.asarray(known), without, trial.redundancy
     )
-
-
-def _needed(equations: _Equations, smooth: Collection[str]) -> tuple[str, ...]:
-    taken: list[str] = []
-    level = LEVEL / len(equations.terms)
-    for among in (smooth, set(equations.terms) - set(smooth)):
-        while (best := equations.next(taken, among)) is not None and best[1] < level:
-            taken.append(best[0])
-    return tuple(term for term in equations.terms if term in taken)

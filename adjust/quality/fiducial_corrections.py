@@ -70,7 +70,9 @@ def corrections_to_given(films: Sequence[Film], places_mm: Array, given_mm: Arra
         source, regular = films[0].comparator_from_camera(places_mm)
         if not regular.all():
             return None
-        by_unknowns = _comparator_by_unknowns(films[0], source)
+        by_places = np.asarray(np.linalg.inv(films[0].gradient(source)), dtype=np.float64)
+        back = _block_product(by_unknowns, by_places)
+        by_unknowns = np.hstack([back, -back @ films[0].design(source).reshape(2 * count, -1)])
     parameters, mirrored = fit_transformation(common, source, places_mm)  # initial values
     kind = film_kind(common, mirrored)
     center, half = source.mean(axis=0), np.array(0.5 * np.ptp(source, axis=0).max())
@@ -84,12 +86,6 @@ def corrections_to_given(films: Sequence[Film], places_mm: Array, given_mm: Arra
     projector = np.eye(len(design)) - design @ inverse
     by_source = _block_product(projector, kind.gradient(parameters, source))
     return Corrections(common, kind.apply(parameters, source) - given_mm, by_source @ by_unknowns)
-
-
-def _comparator_by_unknowns(film: Film, xy_mm: Array) -> Array:
-    """(2n, 2n + k) derivatives of comparator coordinates by camera coordinates and film parameters."""
-    back = _block_product(np.eye(2 * len(xy_mm)), np.asarray(np.linalg.inv(film.gradient(xy_mm)), dtype=np.float64))
-    return np.hstack([back, -back @ film.design(xy_mm).reshape(2 * len(xy_mm), -1)])
 
 
 def _block_product(matrix: Array, by_place: Array) -> Array:

@@ -215,14 +215,6 @@ def _similarity(first: Array, second: Array) -> tuple[Array, Array]:
     return turn, there - turn @ middle
 
 
-def _range(columns: Array) -> Array:
-    """Orthonormal basis (n, r) of the range of columns (n, k)."""
-    sizes = np.linalg.norm(columns, axis=0)
-    vectors, triangle, _ = qr(columns / np.where(sizes > 0, sizes, 1.0), mode="economic", pivoting=True)
-    diagonal = np.abs(np.diag(triangle))
-    return np.asarray(vectors[:, diagonal > _RANK * diagonal.max(initial=0.0)])
-
-
 def _freeing(unseen: Array, marks: int) -> Array:
     """(2 (m + f), 2 (m + f)) projector that removes the similarity fitted to the marks, then the orientation fitted to
     the field, both by unweighted least squares: the remaining field is the smallest possible."""
@@ -270,7 +262,11 @@ def _tests(views: Sequence[_View], times: Array, redundancy: float) -> tuple[Tes
 
     def left_over(*columns: Sequence[Array]) -> tuple[float, int]:
         """v'Pv with some columns, and the rank of the design matrix."""
-        explained = _range(np.hstack([*map(np.vstack, columns), free]))
+        design = np.hstack([*map(np.vstack, columns), free])
+        sizes = np.linalg.norm(design, axis=0)
+        vectors, triangle, _ = qr(design / np.where(sizes > 0, sizes, 1.0), mode="economic", pivoting=True)
+        diagonal = np.abs(np.diag(triangle))
+        explained = np.asarray(vectors[:, diagonal > _RANK * diagonal.max(initial=0.0)])
         rest = y - explained @ (explained.T @ y)
         return float(rest @ rest), explained.shape[1]
 

@@ -24,7 +24,7 @@ from adjust.array_types import Array
 from adjust.errors import AdjustmentError
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import Lens
-from adjust.functional_model.projection import ImageModel, ray_by_orientation, rays, sight_vectors
+from adjust.functional_model.projection import ray_by_orientation, rays, sight_vectors
 from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.problem.camera import Camera, Corners
 from adjust.problem.estimates import Estimates, adjusted_image, adjusted_lens, adjusted_places, observed_places
@@ -140,31 +140,30 @@ class LensReach:
 
 def lens_reach(estimates: Estimates, camera: Camera, frame_mm: tuple[float, float] | None) -> LensReach | None:
     """Find the extent of the observations of a lens; None without observations. frame_mm: width and height."""
-    observations = estimates.network.observations
-    principal_point = np.array([estimates.value(Parameter.interior(camera.name, each)) for each in ("x0", "y0")])
+    observations, lens = estimates.network.observations, adjusted_lens(estimates, camera.name)
     rows, places_mm = observed_places(estimates, camera.name, observations.xy_mm)
-    observed = places_mm[~observations.is_fiducial[rows]]
+    observed, principal_point = places_mm[~observations.is_fiducial[rows]], lens.interior[1:]
     if not len(observed):
         return None
     radius_mm = float(np.linalg.norm(observed - principal_point, axis=1).max())
     corner_mm, corners = np.nan, None if frame_mm is None else camera.frame_corners(observed, frame_mm)
     if corners is not None:
         corner_mm = float(np.linalg.norm(np.abs(np.array(corners) - principal_point).max(axis=0)))
-    within = max(_sigma_um(estimates, camera, radius) for radius in np.linspace(0.0, radius_mm, REACH_RADII + 1)[1:])
-    beyond = _sigma_um(estimates, camera, corner_mm) if np.isfinite(corner_mm) else np.nan
-    return LensReach(radius_mm, corner_mm, within, beyond, corners)
-
-
-def _sigma_um(estimates: Estimates, camera: Camera, radius_mm: float) -> float:
-    """The largest standard deviation of the distortion at a radius, over all directions and along any."""
-    lens = adjusted_lens(estimates, camera.name)
     unknowns = [Parameter.interior(camera.name, each) for each in lens.quantities if each not in ("x0", "y0")]
-    moved = lens.displacement(radius_mm * directions(REACH_DIRECTIONS))
-    if not moved.imaged.all():
-        return np.nan
-    by = moved.by_unknowns_um
-    variances = np.linalg.eigvalsh(by @ estimates.cofactor_of(unknowns) @ by.swapaxes(1, 2))[:, -1]
-    return estimates.sigma0 * float(np.sqrt(max(variances.max(), 0.0)))
+    cofactor = estimates.cofactor_of(unknowns)
+
+    def sigma_um(radius_mm: float) -> float:
+        """The largest standard deviation of the distortion at a radius, over all directions and along any."""
+        moved = lens.displacement(radius_mm * directions(REACH_DIRECTIONS))
+        if not moved.imaged.all():
+            return np.nan
+        by = moved.by_unknowns_um
+        variances = np.linalg.eigvalsh(by @ cofactor @ by.swapaxes(1, 2))[:, -1]
+        return estimates.sigma0 * float(np.sqrt(max(variances.max(), 0.0)))
+
+    within = max(sigma_um(radius) for radius in np.linspace(0.0, radius_mm, REACH_RADII + 1)[1:])
+    beyond = sigma_um(corner_mm) if np.isfinite(corner_mm) else np.nan
+    return LensReach(radius_mm, corner_mm, within, beyond, corners)
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +217,12 @@ def projection_uncertainty(
     field = ProjectionField(estimates, only_camera(estimates, camera))
     known = estimates.sigma0**2 * estimates.cofactor_of([*field.calibration, *field.films])
     covariances = known, clusters(field.calibration)
-    places = frame_grid(field.corners_mm, GRID) if places_mm is None else np.asarray(places_mm, dtype=float)
+    if places_mm is None:  # a grid over the image, the upper row first
+        low, high = np.asarray(field.corners_mm, float)
+        counts = np.maximum(np.rint(GRID * (high - low) / (high - low).max()), 3).astype(int)
+        x, y = np.linspace(low[0], high[0], counts[0]), np.linspace(high[1], low[1], counts[1])
+        places_mm = np.stack(np.meshgrid(x, y), axis=-1)
+    places = np.asarray(places_mm, dtype=float)
     flat, shape = places.reshape(-1, 2), (*places.shape[:-1], 2, 2)
     model, robust = (
         None if each is None else field.covariance_mm2(each, flat, distance).reshape(shape) for each in covariances
@@ -278,7 +282,9 @@ class ProjectionField:
         for image in shown[:: -(-len(shown) // MOST_IMAGES)]:
             rows = np.flatnonzero(is_target & (of_image == image.name))
             model = adjusted_image(estimates, image.name)
-            ray, depth = _targets(model, adjusted_places(estimates, [observations.point[row] for row in rows]))
+            xyz = adjusted_places(estimates, [observations.point[row] for row in rows])
+            ray, in_camera = rays(model.rotation, sight_vectors(model.line_of_sight, model.station, xyz).vector)
+            depth = np.abs(in_camera[:, 2])
             places.append(model.camera_from_comparator(observations.xy_mm[rows]))
             distances.append(depth * np.sqrt(1.0 + (ray**2).sum(axis=1)))
             by, turn = self._derivatives(places[-1], ray, 1.0 / depth)
@@ -334,23 +340,9 @@ class ProjectionField:
         return by, np.asarray(-np.linalg.solve(at.xy_jacobian, at.ray_jacobian @ orientation), dtype=np.float64)
 
 
-def frame_grid(corners_mm: Sequence[Sequence[float]] | Array, longer: int) -> Array:
-    """(rows, columns, 2) grid over a frame given by its lower left and upper right corner, the upper row first."""
-    low, high = np.asarray(corners_mm, float)
-    counts = np.maximum(np.rint(longer * (high - low) / (high - low).max()), 3).astype(int)
-    x, y = np.linspace(low[0], high[0], counts[0]), np.linspace(high[1], low[1], counts[1])
-    return np.stack(np.meshgrid(x, y), axis=-1)
-
-
 def _film_derivatives(film: Film, xy_mm: Array) -> Array:
     """(n, 2, q) derivatives of camera points by the parameters of an image's film transformation."""
     return film.design(film.comparator_from_camera(xy_mm)[0])
-
-
-def _targets(model: ImageModel, xyz: Array) -> tuple[Array, Array]:
-    """Rays (n, 2) and depths (n,) of object points."""
-    ray, in_camera = rays(model.rotation, sight_vectors(model.line_of_sight, model.station, xyz).vector)
-    return ray, np.abs(in_camera[:, 2])
 
 
 def _largest_sigma(covariance: Array) -> Array:

@@ -199,25 +199,18 @@ class Snooping:
 
     @cached_property
     def critical(self) -> Array:
-        """(N,) critical values of the statistics; inf for untested units."""
-        tests = self.run.statistics
-        is_tested = tests.sizes > 0
-        critical = self.probabilities.critical(tests.sizes, int(is_tested.sum()))
-        return np.where(is_tested & ~self._impossible, critical, np.inf)
-
-    @property
-    def _impossible(self) -> Mask:
-        """(N,) mask of units whose estimated gross error is impossible: a principal distance wrong by more than itself.
-
-        Over flat ground v'Pv hardly depends on the principal distance. Its small slope may come from elsewhere, such as
-        errors of given heights, and looks like a gross error of metres in the linear model.
-        """
-        run, observed = self.run, len(self.run.end.v_mm)
-        positions = run.units.positions[:, 0]
+        """(N,) critical values of the statistics; inf for untested units, and for principal distances wrong by more
+        than themselves."""
+        # Over flat ground v'Pv hardly depends on the principal distance. Its small slope may come from elsewhere, such
+        # as errors of given heights, and looks like a gross error of metres in the linear model.
+        run, tests, observed = self.run, self.run.statistics, len(self.run.end.v_mm)
+        positions, is_tested = run.units.positions[:, 0], tests.sizes > 0
         is_distance = np.isin(positions, [some[0] for some in run.problem.unknowns.camera.values()])
-        errors = np.abs(run.statistics.error[observed:, 0])
-        impossible = is_distance & (errors > np.abs(run.end.state.values[positions]))
-        return np.concatenate([np.zeros(observed, dtype=bool), impossible])
+        errors = np.abs(tests.error[observed:, 0])
+        is_possible = np.ones(len(tests.sizes), dtype=bool)
+        is_possible[observed:] = ~(is_distance & (errors > np.abs(run.end.state.values[positions])))
+        critical = self.probabilities.critical(tests.sizes, int(is_tested.sum()))
+        return np.where(is_tested & is_possible, critical, np.inf)
 
     @property
     def limits(self) -> Array:

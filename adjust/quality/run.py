@@ -119,6 +119,7 @@ class Run:
 
     @property
     def has_solution(self) -> bool:
+        """Whether the iteration ended with a solution; its system is regular."""
         return self.solution.factor is not None
 
     @property
@@ -285,7 +286,7 @@ class Group:
 def residuals(run: Run) -> Residuals:
     """Residuals with redundancy numbers and standardised residuals; the latter two are 0 without a solution."""
     v_mm = run.end.v_mm
-    if not (run.has_solution and run.is_tested):
+    if not run.has_solution:
         return Residuals(v_mm, np.zeros_like(v_mm), np.zeros_like(v_mm))
     return Residuals(v_mm, run.redundancies[: len(v_mm)], run.statistics.w[: len(v_mm)])
 
@@ -326,7 +327,7 @@ def groups(run: Run, further: Sequence[FurtherResidual]) -> dict[str, Group]:
         members = (run.units.groups == name) & run.weighting.used
         if not members.any() and name not in ("target", "fiducial", "control"):
             continue
-        sums = run.group_sums(members) if run.has_solution and run.is_tested else (0.0, 0.0)
+        sums = run.group_sums(members) if run.has_solution else (0.0, 0.0)
         result[name] = _group(*sums, *_rms_um(run, name, members))
     for name in dict.fromkeys(each.group for each in problem.further):
         vpv = square_sum(tuple(each for each in problem.further if each.group == name), run.end.state.values)

@@ -19,7 +19,7 @@ from itertools import combinations
 import numpy as np
 from scipy.special import chdtrc, fdtrc, ndtr, stdtr
 
-from adjust.array_types import Array, Mask
+from adjust.array_types import Array
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.rotation import rotation_from_angles, vector_by_angles
@@ -188,7 +188,12 @@ def calibration_tests(run: Run, sigma0: float, redundancy: float) -> Iterator[Ca
         chi_square = float((u[visible] ** 2 / free[visible]).sum())
         left = round(redundancy) - freedom
         variance = (vpv - chi_square) / left if left > 0 and vpv > chi_square else 1.0
-        along = _as_marks_show(root @ directions, ~visible, each.parameters)
+        # The frame of the marks can shift, rotate and scale together with the camera. Undetermined changes are combined
+        # with the others such that the marks move least: as in a comparison of two calibrations, the change of c is
+        # then the one relative to the marks.
+        along, is_mark = root @ directions, np.array([one.kind == "fiducial" for one in each.parameters])
+        by_marks = np.linalg.pinv(along[:, ~visible] * is_mark[:, None], rcond=UNSEEN)
+        along = along - along[:, ~visible] @ (by_marks @ along)
         difference = along[:, visible] @ (u[visible] / free[visible])
         sigma = np.sqrt(variance * (along[:, visible] ** 2 / free[visible]).sum(axis=1))
         hidden = (along[:, ~visible] ** 2).sum(axis=1) > UNSEEN * np.diag(each.covariance)
@@ -202,15 +207,6 @@ def calibration_tests(run: Run, sigma0: float, redundancy: float) -> Iterator[Ca
             freedom=freedom,
             probability=f_probability(test, freedom, left),
         )
-
-
-def _as_marks_show(along: Array, unseen: Mask, parameters: Sequence[Parameter]) -> Array:
-    """Combine changes (n, m) of the quantities with undetermined ones such that the fiducial marks move least."""
-    # The frame of the marks can shift, rotate and scale together with the camera. As in a comparison of two
-    # calibrations, the reported change of c is then the one relative to the marks.
-    is_mark = np.array([each.kind == "fiducial" for each in parameters])
-    by_marks = np.linalg.pinv(along[:, unseen] * is_mark[:, None], rcond=UNSEEN)
-    return np.asarray(along - along[:, unseen] @ (by_marks @ along))
 
 
 DIRECTIONS = (  # of an exterior orientation: kind, and words
@@ -266,20 +262,23 @@ class Correlation:
     remedy: str
 
 
-def correlations(estimates: Estimates, above: float = HIGH) -> tuple[Correlation, ...]:
-    """Correlations above a limit between parameters of one camera, and between them and exterior orientations.
+def correlations(estimates: Estimates) -> tuple[Correlation, ...]:
+    """Correlations above HIGH between parameters of one camera, and between them and exterior orientations.
 
     Sorted, the highest first; none where there is no solution.
     """
     if not estimates.converged:
         return ()
-    found = [each for camera in estimates.network.cameras for each in _camera_correlations(estimates, camera, above)]
+    found = [each for camera in estimates.network.cameras for each in _camera_correlations(estimates, camera)]
     return tuple(sorted(found, key=lambda each: -abs(each.rho)))
 
 
-def _camera_correlations(estimates: Estimates, camera: Camera, above: float) -> Iterator[Correlation]:
-    own, kinds, words = [], [], []
-    for name, kind in _parameter_kinds(camera).items():
+def _camera_correlations(estimates: Estimates, camera: Camera) -> Iterator[Correlation]:
+    lens, own, kinds, words = family(camera.distortion.family), list[Parameter](), list[str](), list[str]()
+    kind_of = {"c": "c", "x0": "point", "y0": "point"} | dict.fromkeys(lens.parameters, "other")
+    for group, names in reversed(lens.groups):
+        kind_of |= dict.fromkeys(names, group)
+    for name, kind in kind_of.items():
         if _is_free(estimates, Parameter.interior(camera.name, name)):
             own.append(Parameter.interior(camera.name, name))
             kinds.append(kind)
@@ -287,10 +286,11 @@ def _camera_correlations(estimates: Estimates, camera: Camera, above: float) -> 
     if not own:
         return
     known = len(estimates.network.known_places) >= FIELD
-    marks = _free_marks(estimates, camera)
-    own_rho = _correlation(_hold_figure(estimates.cofactor_of([*own, *marks]), len(own), _figure(estimates, marks)))
+    pairs = [[Parameter.fiducial(camera.name, id_, axis) for axis in "xy"] for id_ in camera.fiducials]
+    marks = [each for pair in pairs if all(_is_free(estimates, one) for one in pair) for each in pair]
+    own_rho = _correlation(_cofactor_in_datum(estimates, own, marks))
     for i, j in combinations(range(len(own)), 2):
-        if abs(own_rho[i, j]) > above:
+        if abs(own_rho[i, j]) > HIGH:
             rho = float(own_rho[i, j])
             why, remedy = _cause(kinds[i], kinds[j], known)
             cause = f"{words[i]} and {words[j]} of camera {camera.name} are correlated by {rho:.3f}: {why}."
@@ -299,7 +299,7 @@ def _camera_correlations(estimates: Estimates, camera: Camera, above: float) -> 
     parts = [frames[i : i + IMAGES_AT_ONCE] for i in range(0, len(frames), IMAGES_AT_ONCE)]
     all_rho = np.concatenate([_exterior_correlations(estimates, own, marks, part) for part in parts])
     for i, direction in np.ndindex(len(own), len(DIRECTIONS)):
-        high = [row for row in range(len(frames)) if abs(all_rho[row, i, direction]) > above]
+        high = [row for row in range(len(frames)) if abs(all_rho[row, i, direction]) > HIGH]
         if high:
             rho = float(max(all_rho[high, i, direction], key=abs))
             elements, what, owner = _exterior_words(estimates, frames, high, direction)
@@ -309,44 +309,27 @@ def _camera_correlations(estimates: Estimates, camera: Camera, above: float) -> 
             yield Correlation((own[i], *exterior), rho, cause, remedy)
 
 
-def _parameter_kinds(camera: Camera) -> dict[str, str]:
-    """Kind of each parameter of a camera: c, point, a group of the distortion family, other."""
-    lens = family(camera.distortion.family)
-    kinds = {"c": "c", "x0": "point", "y0": "point"} | dict.fromkeys(lens.parameters, "other")
-    for group, names in reversed(lens.groups):
-        kinds |= dict.fromkeys(names, group)
-    return kinds
-
-
 def _is_free(estimates: Estimates, parameter: Parameter) -> bool:
     return estimates.has(parameter) and estimates.sigma(parameter) > 0.0
 
 
-def _free_marks(estimates: Estimates, camera: Camera) -> list[Parameter]:
-    """x and y of every estimated fiducial, x before y."""
-    pairs = [[Parameter.fiducial(camera.name, id_, axis) for axis in "xy"] for id_ in camera.fiducials]
-    return [each for pair in pairs if all(_is_free(estimates, one) for one in pair) for each in pair]
-
-
-def _figure(estimates: Estimates, marks: Sequence[Parameter]) -> Array:
-    """(k, m) shift, rotation and scale of fiducial coordinates (m,)."""
-    xy = estimates.values_of(marks).reshape(-1, 2)
-    if len(xy) < 2:
-        return np.zeros((0, len(marks)))
-    x, y = (xy - xy.mean(axis=0)).T
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    pairs = [(one, zero), (zero, one), (-y, x), (x, y)]
-    return np.array([np.stack(pair, axis=1).ravel() for pair in pairs])
-
-
-def _hold_figure(cofactor: Array, count: int, figure: Array) -> Array:
-    """Conditional cofactor matrix of the quantities, given the figure (k, m) of the m that follow the first `count`."""
+def _cofactor_in_datum(
+    estimates: Estimates, own: Sequence[Parameter], marks: Sequence[Parameter], further: Sequence[Parameter] = ()
+) -> Array:
+    """Cofactor matrix of parameters of a camera and further ones, given shift, rotation and scale of its marks."""
     # For functions f x that are held: Q - Q f' (f Q f')^-1 f Q; for a vague datum this is Baarda's S-transformation.
-    size = figure.shape[1]
+    cofactor, count, size = estimates.cofactor_of([*own, *marks, *further]), len(own), len(marks)
+    xy = estimates.values_of(marks).reshape(-1, 2)
+    figure = np.zeros((0, size))
+    if len(xy) > 1:
+        x, y = (xy - xy.mean(axis=0)).T
+        one, zero = np.ones_like(x), np.zeros_like(x)
+        pairs = [(one, zero), (zero, one), (-y, x), (x, y)]
+        figure = np.array([np.stack(pair, axis=1).ravel() for pair in pairs])
     keep = np.r_[:count, count + size : len(cofactor)]
     by_figure = figure @ cofactor[count : count + size]
-    own = by_figure[:, count : count + size] @ figure.T
-    held = cofactor - by_figure.T @ np.linalg.pinv(own, rcond=1e-12, hermitian=True) @ by_figure
+    own_part = by_figure[:, count : count + size] @ figure.T
+    held = cofactor - by_figure.T @ np.linalg.pinv(own_part, rcond=1e-12, hermitian=True) @ by_figure
     return np.asarray(held[np.ix_(keep, keep)])
 
 
@@ -361,7 +344,7 @@ def _exterior_correlations(
 ) -> Array:
     """(images, k, 6) correlations of k parameters with the six directions of every exterior orientation."""
     exterior = [Parameter.exterior(image, element) for image in images for element in EXTERIOR_NAMES]
-    cofactor = _hold_figure(estimates.cofactor_of([*own, *marks, *exterior]), len(own), _figure(estimates, marks))
+    cofactor = _cofactor_in_datum(estimates, own, marks, exterior)
     turn = np.eye(len(cofactor))
     for i, image in enumerate(images):
         at = slice(len(own) + 6 * i, len(own) + 6 * i + 6)

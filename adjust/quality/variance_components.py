@@ -16,7 +16,7 @@ from scipy.special import fdtr
 from adjust.array_types import Array, Indices, Mask
 from adjust.least_squares.equations import prior_differences
 from adjust.problem.estimates import GivenGroup, VarianceFactor
-from adjust.problem.problem import ABSENT, Problem
+from adjust.problem.problem import ABSENT
 from adjust.quality.critical_values import Weighting
 from adjust.quality.run import Run
 
@@ -65,22 +65,19 @@ def variance_factor(run: Run, redundancy: int) -> VarianceFactor:
     if left < LEAST_REDUNDANCY:
         return VarianceFactor(1.0, 0.0)
     variance = (vpv - sum(each.vpv for each in given)) / left
-    out = [each for each in given if variance > ERROR_FREE and _places_only(problem, each, variance, left)]
+    out = list[_Given]()
+    for each in given if variance > ERROR_FREE else ():
+        is_alone = each.group.group == "datum" and each.group.owner in problem.network.idle_cameras
+        # If the others contain gross errors, given values must not count as too good for being better than these.
+        p = fdtr(each.redundancy, left, each.vpv / each.redundancy / min(variance, 1.0))
+        if (is_alone and each.evidence < NO_EVIDENCE) or p < TOO_GOOD:
+            out.append(each)
     if not out:
         return VarianceFactor(float(np.sqrt(vpv / redundancy)), redundancy)
     own = redundancy - sum(each.redundancy for each in out)
     sigma0 = np.sqrt((vpv - sum(each.vpv for each in out)) / own)
     groups = tuple(dict.fromkeys(each.group for each in out))
     return VarianceFactor(float(sigma0), own, groups, np.concatenate([each.positions for each in out]))
-
-
-def _places_only(problem: Problem, given: _Given, variance: float, redundancy: float) -> bool:
-    """Whether given values only place the datum and are no evidence of the noise."""
-    alone = given.group.group == "datum" and given.group.owner in problem.network.idle_cameras
-    if alone and given.evidence < NO_EVIDENCE:
-        return True
-    # If the others contain gross errors, given values must not count as too good for being better than these.
-    return bool(fdtr(given.redundancy, redundancy, given.vpv / given.redundancy / min(variance, 1.0)) < TOO_GOOD)
 
 
 def _given_groups(run: Run) -> Iterator[_Given]:
@@ -101,14 +98,11 @@ def _given_groups(run: Run) -> Iterator[_Given]:
             positions = positions[np.argsort(sigma[positions], kind="stable")]
             parts = np.split(positions, np.flatnonzero(sigma[positions][1:] > APART * sigma[positions][:-1]) + 1)
         for some in filter(len, parts):
-            q = run.factor.function_cofactor(_unit_rows(numbering.numbers[some], len(numbering.free)))
+            entries = np.ones(len(some)), (np.arange(len(some)), numbering.numbers[some])
+            q = run.factor.function_cofactor(csr_array(entries, shape=(len(some), len(numbering.free))))
             free = np.eye(len(some)) - q / np.outer(sigma[some], sigma[some])
             vpv = float(((differences[some] / sigma[some]) ** 2).sum())
             yield _Given(group, some, vpv, float(np.trace(free)), 1.0 - float(np.linalg.eigvalsh(free)[-1]))
-
-
-def _unit_rows(columns: Indices, width: int) -> csr_array:
-    return csr_array((np.ones(len(columns)), (np.arange(len(columns)), columns)), shape=(len(columns), width))
 
 
 def added_variance(squares: Array, variances: Array, redundancy: float) -> float | None:
@@ -166,13 +160,10 @@ def _traces(run: Run, members: Sequence[Mask]) -> Array:
     squares = []
     for of_group in members:
         functions = run.unit_functions[np.repeat(of_group, 2)]
-        columns = (
-            functions.T.toarray() if functions.shape[0] <= MOST_COLUMNS else functions.T @ _signs(functions.shape[0])
-        )
+        if (count := functions.shape[0]) > MOST_COLUMNS:
+            signs = np.random.default_rng(0).choice([-1.0, 1.0], (count, SIGNS)) / np.sqrt(SIGNS)
+            columns = functions.T @ signs
+        else:
+            columns = functions.T.toarray()
         squares.append(((run.unit_functions @ run.factor.cofactor_times(columns)) ** 2).sum(axis=1))
     return np.asarray(np.repeat(members, 2, axis=1) @ np.array(squares).T)
-
-
-def _signs(count: int) -> Array:
-    """(count, SIGNS) random signs over the root of their number."""
-    return np.asarray(np.random.default_rng(0).choice([-1.0, 1.0], (count, SIGNS)) / np.sqrt(SIGNS))

@@ -1,30 +1,28 @@
 """Simultaneous adjustment of cameras, fiducial marks, images and object points (Torlegård's F1 to F9).
 
-Blunders of the whole network are refused. Images that keep it from a solution are left out, and so, at the start of
-robust methods, are given points whose blunders are too large for coordinates as observations.
+Blunders of the whole network are refused. Images that keep it from a solution, or contradict the others, are left out,
+and so, at the start of robust methods, are given points whose blunders are too large for coordinates as observations.
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from adjust.array_types import Array
 from adjust.errors import AdjustmentError, DatumError, NoImageError, UnorientedError
 from adjust.functional_model.lens import Prior
 from adjust.initial_values.approximations import initial_values
-from adjust.initial_values.mismatches import Mismatches, find_mismatches, started_rays
-from adjust.initial_values.pose import intersect
+from adjust.initial_values.mismatches import Mismatches, find_mismatches
 from adjust.least_squares.malloc_tuning import keep_freed_memory, pause_cycle_search
-from adjust.problem.network import Approximations, Network, ObjectPoint
-from adjust.problem.parameter import shortened
-from adjust.problem.problem import Problem, number, number_reduced
+from adjust.problem.network import Approximations, Network
+from adjust.problem.parameter import Parameter, shortened
+from adjust.problem.problem import Problem, number_reduced
 from adjust.problem.unknowns import Reduction
 from adjust.quality.variance_components import added_variance
 from adjust.rank_defect.datum import held_as_known
@@ -35,13 +33,7 @@ from adjust.solution.blunder_hypotheses import (
     misnumbered_images,
     stations_elsewhere,
 )
-from adjust.solution.contradicting_images import (
-    adopt_lens,
-    fitting,
-    is_of_some_frames,
-    leave_out,
-    leave_out_contradicting,
-)
+from adjust.solution.coordinate_blunders import CoordinateBlunder, find_coordinate_blunders
 from adjust.solution.options import Datum, Method, Options
 from adjust.solution.result import Adjustment, adjust_problem
 from adjust.validation import validate
@@ -51,14 +43,19 @@ __all__ = ["Datum", "Method", "Options", "adjust", "adjust_unmodelled"]
 GUESSED = 0.1  # relative standard deviation of a principal distance above which the value is a guess
 TRIAL_STEPS = 6  # iterations of a trial adjustment, enough to test v'Pv, which decreases with each
 NAMED = 5  # images named in a message
-CLEARER = 3.0  # factor by which errors fall without images that contradict the others
 ROUNDS = 6  # two or three suffice: nearly equal weights hardly change the residuals
+ENOUGH = 5  # points needed to identify a wrong one: the resection without it is still redundant
+FITTING = 3.0  # in sigma0 of the others: largest rms standardised residual of an image that agrees with them
+CONTRADICTING = 0.5  # share in the squared errors of a camera's images above which some may contradict the others
+TRIED = 3  # images left out in turn, those with the largest errors
+WHOLE = 3.0  # in given standard deviations: median residual of an image that contradicts the others as a whole
+MOST_CONTRADICTING = 1 / 3  # fraction of the images
+FEWEST_RAYS = 2  # rays needed for a point without priors
+# Unmodelled errors:
+CLEARER = 3.0  # factor by which errors fall without images that contradict the others
 FIRST = 1e-3  # initial value, fraction of the frame's diagonal: above any lens misfit, below a blunder
 PLAUSIBLE = 3e-4  # fraction of the frame's diagonal that lens, board and processing may cause: 1.5 px of 5000 px
 SETTLED = 0.01  # relative change of a standard deviation that means convergence
-MOST_FAR = 0.25  # fraction of the given points: if more are far off, the correct ones cannot be identified
-FEWEST_IMAGES = 2  # images needed for an intersection
-ENOUGH = 5  # points needed to identify a wrong one: the resection without it is still redundant
 
 
 def adjust(
@@ -131,7 +128,7 @@ def adjust_unmodelled(network: Network, options: Options | None = None) -> Adjus
     doubtful = [
         name
         for name, limit_mm in plausible_mm.items()
-        if limit_mm and (first.unmodelled_mm[name] > limit_mm or is_of_some_frames(first, name))
+        if limit_mm and (first.unmodelled_mm[name] > limit_mm or _is_of_some_frames(first, name))
     ]
 
     def agrees(result: Adjustment) -> bool:
@@ -144,7 +141,7 @@ def adjust_unmodelled(network: Network, options: Options | None = None) -> Adjus
     result = first
     if doubtful:
         refitted = partial(_fit_unmodelled, options=options)
-        result = leave_out_contradicting(network, first, refitted, agrees, several=True)
+        result = _leave_out_contradicting(network, first, refitted, agrees, several=True)
     warnings = (
         f"Camera {name}: errors of {1000.0 * sigma_mm:.3g} µm are not modelled, one part in "
         f"{plausible_mm[name] / PLAUSIBLE / sigma_mm:.0f} of the picture's diagonal. Look for pictures that are "
@@ -156,20 +153,29 @@ def adjust_unmodelled(network: Network, options: Options | None = None) -> Adjus
 
 
 def _fit_unmodelled(network: Network, options: Options) -> Adjustment:
-    """Adjust a network with standard deviations of unmodelled errors by camera that its residuals confirm."""
+    """Adjust a network with standard deviations of unmodelled errors by camera with which v'Pv of its marks equals
+    their redundancy."""
     sigma_mm = {each.name: FIRST * float(np.hypot(*each.frame_mm)) for each in network.cameras}
-    result = adjust(add_unmodelled(network, sigma_mm), options=options)
+    result = adjust(_add_unmodelled(network, sigma_mm), options=options)
     for _ in range(ROUNDS):
         if not result.converged:
             break
-        before, sigma_mm = sigma_mm, _components_mm(result, sigma_mm)
-        if all(abs(sigma_mm[each] - before[each]) <= SETTLED * sigma_mm[each] for each in sigma_mm):
+        before_mm, sigma_mm = sigma_mm, {}
+        cameras, residuals = _cameras(result.network), result.residuals
+        variances = np.diagonal(result.network.observations.covariance_mm2, axis1=1, axis2=2)
+        for camera, before in before_mm.items():
+            rows = cameras == camera
+            redundancy = float(residuals.redundancy[rows].sum())
+            squares, given = residuals.v_mm[rows] ** 2, variances[rows] - before**2
+            added = added_variance(squares, given, redundancy) if redundancy >= 1.0 else None
+            sigma_mm[camera] = float(np.sqrt(added or 0.0))
+        if all(abs(sigma_mm[each] - before_mm[each]) <= SETTLED * sigma_mm[each] for each in sigma_mm):
             break
-        result = adjust(add_unmodelled(network, sigma_mm), result.start, options)
+        result = adjust(_add_unmodelled(network, sigma_mm), result.start, options)
     return replace(result, unmodelled_mm=sigma_mm)
 
 
-def add_unmodelled(network: Network, sigma_mm: Mapping[str, float]) -> Network:
+def _add_unmodelled(network: Network, sigma_mm: Mapping[str, float]) -> Network:
     """Add a standard deviation by camera to the targets and tie points of a network."""
     added = np.array([sigma_mm.get(camera, 0.0) for camera in _cameras(network)]) ** 2
     covariance_mm2 = network.observations.covariance_mm2 + added[:, None, None] * np.eye(2)
@@ -188,19 +194,6 @@ def _marks_sigma_mm(result: Adjustment, camera: str) -> float:
     return float(np.sqrt(np.trace(covariance_mm2, axis1=1, axis2=2).mean() / 2.0))
 
 
-def _components_mm(result: Adjustment, before_mm: Mapping[str, float]) -> dict[str, float]:
-    """Standard deviations by camera with which v'Pv of its marks equals their redundancy, for the current residuals."""
-    found, cameras, residuals = dict[str, float](), _cameras(result.network), result.residuals
-    variances = np.diagonal(result.network.observations.covariance_mm2, axis1=1, axis2=2)
-    for camera, before in before_mm.items():
-        rows = cameras == camera
-        redundancy = float(residuals.redundancy[rows].sum())
-        squares, given = residuals.v_mm[rows] ** 2, variances[rows] - before**2
-        added = added_variance(squares, given, redundancy) if redundancy >= 1.0 else None
-        found[camera] = float(np.sqrt(added or 0.0))
-    return found
-
-
 @dataclass(frozen=True)
 class _Solver:
     """Adjust networks with given options."""
@@ -209,11 +202,9 @@ class _Solver:
 
     @property
     def trials(self) -> Trials:
-        return Trials(lambda network: self.solve_plainly(network, self.own_start(network)), self.family)
-
-    @property
-    def family(self) -> float:
-        return self.options.probabilities.family
+        return Trials(
+            lambda network: self.solve_plainly(network, self.own_start(network)), self.options.probabilities.family
+        )
 
     def initial_values(self, network: Network) -> Approximations:
         return initial_values(held_as_known(network, self.options.datum_coordinates))
@@ -227,7 +218,7 @@ class _Solver:
 
     def remainder(self, network: Network, reasons: Mapping[str, str]) -> tuple[Network, Approximations] | None:
         """Leave out some frames; return the rest with its own approximations, None where too little is left."""
-        rest = leave_out(network, reasons) if reasons else None
+        rest = _leave_out(network, reasons) if reasons else None
         start = None if rest is None else self.own_start(rest)
         return None if rest is None or start is None else (rest, start)
 
@@ -238,7 +229,7 @@ class _Solver:
         too little would remain or something else is wrong.
         """
         misnumbered = misnumbered_images(network)
-        part = leave_out(network, misnumbered) if misnumbered else network
+        part = _leave_out(network, misnumbered) if misnumbered else network
         if part is None:
             sentences = dict.fromkeys(misnumbered.values())
             raise AdjustmentError(" ".join(f"{each[0].upper()}{each[1:]}" for each in sentences))
@@ -264,7 +255,7 @@ class _Solver:
             return self.adjust_without_blind(rest, self.initial_values(rest))
 
         if first.termination != "singular":
-            found = leave_out_contradicting(part, first, adjusted, agrees, several=False)
+            found = _leave_out_contradicting(part, first, adjusted, agrees, several=False)
         return replace(found, left_out={**left_out, **found.left_out})
 
     def adjust_without_blind(self, part: Network, start: Approximations | None) -> Adjustment:
@@ -284,15 +275,15 @@ class _Solver:
         """Adjust with those left-out images that fit once the lens is known."""
         found, left_out = rest, rest.left_out
         if rest.converged:
-            _, start, reasons = self.orientable(adopt_lens(network, rest))
+            _, start, reasons = self.orientable(_adopt_lens(network, rest))
             came = left_out.keys() - reasons.keys()
             while start is not None and came:
-                part = leave_out(network, left_out.keys() - came)
+                part = _leave_out(network, left_out.keys() - came)
                 if part is None:
                     break
                 try:
                     tried = self.check_points(part, start)
-                    fit = fitting(tried, came, rest.sigma0) if tried.converged else set()
+                    fit = _fitting(tried, came, rest.sigma0) if tried.converged else set()
                 except NoImageError as error:
                     tried, fit = rest, came - error.reasons.keys()
                 if fit == came:
@@ -335,19 +326,39 @@ class _Solver:
 
     def check_points(self, network: Network, start: Approximations) -> Adjustment:
         """Adjust a network and report given points with coordinate blunders."""
+        # Robust estimation and data snooping start without these points: from an adjustment that includes a blunder
+        # neither recovers, since the linearised equations do not hold for errors so large.
+        result: Adjustment | None = None
         try:
-            result = self._start_robustly(network, start) or self.solve(network, start)
+            begins_without = self.options.robust or self.options.snooping
+            if begins_without and (blunders := self.coordinate_blunders(network, start)):
+                places = {each.name: each.place for each in blunders}
+                with suppress(NoImageError):
+                    result = self.solve(network, replace(start, points={**start.points, **places}), places)
+            if result is None or not result.converged:
+                result = self.solve(network, start)
         except NoImageError as error:
-            if slips := self._slips(network, start):
-                raise AdjustmentError(" ".join(slip.sentence for slip in slips)) from error
+            if blunders := self.coordinate_blunders(network, start):
+                raise AdjustmentError(" ".join(each.sentence for each in blunders)) from error
             raise
         if result.termination not in ("converged", "singular"):
             result = self._begin_anew(network, start, result)
         if result.termination == "singular" or (result.converged and self.agrees(result)):
             return result
-        if slips := self._slips(network, start):
-            return replace(result, slips={slip.name: slip.sentence for slip in slips})
-        return result if result.converged else replace(result, remarks=(*result.remarks, *_few_points(network)))
+        if blunders := self.coordinate_blunders(network, start):
+            return replace(result, slips={each.name: each.sentence for each in blunders})
+        given = sorted(name for name in network.known_places if name in network.observed_points)
+        if result.converged or len(given) != ENOUGH - 1:
+            return result
+        remark = (
+            f"The points {', '.join(given)} alone are given in X, Y and Z: if the coordinates of one of the "
+            f"{len(given)} are wrong, nothing tells which. Check all of them, or give another point."
+        )
+        return replace(result, remarks=(*result.remarks, remark))
+
+    def coordinate_blunders(self, network: Network, start: Approximations) -> list[CoordinateBlunder]:
+        solve = partial(self.solve, plain=True)
+        return find_coordinate_blunders(network, start, solve, self.options.probabilities)
 
     def solve(
         self, network: Network, start: Approximations, doubted_points: Iterable[str] = (), plain: bool = False
@@ -357,29 +368,32 @@ class _Solver:
         doubted_points: points whose given coordinates are left out at first. plain: with the weights as given.
         """
         options, doubted = self.options.plain if plain else self.options, list(doubted_points)
-        given = numbered = number_reduced(network, start, options.method == "elements")
-        found, result = find_mismatches(given[0]), None
+        earlier: Mismatches | None = None
+        result: Adjustment | None = None
         # Orientations that the worst mismatches have not spoilt show the smaller ones, and which rays meet after all.
         for _ in range(ROUNDS):
+            numbered = number_reduced(network, start, options.method == "elements")
+            found = find_mismatches(numbered[0])
+            if earlier is not None and found.agrees(earlier):
+                break
             places = {name: place + numbered[1].origin for name, place in found.places.items()}
-            start, (rest, mismatched) = replace(start, points={**start.points, **places}), _without(network, found)
-            parts = number_reduced(rest, start, given[0].by_elements) if places else numbered
+            start, parts = replace(start, points={**start.points, **places}), numbered
+            rest, mismatched, unmet = _without_mismatches(network, found)
+            if places:
+                parts = number_reduced(rest, start, options.method == "elements")
             now = _solve(rest, parts, options, doubted, mismatched)
             if not now.converged:
-                return result or (_solve(network, given, options, doubted, {}) if places else now)
-            result = replace(now, unmet=_unmet_sentences(network, found))
+                return result or (_solve(network, numbered, options, doubted, {}) if places else now)
+            result, earlier = replace(now, unmet=unmet), found
             if not places and self.agrees(result):
                 break
             start = replace(result.approximations, points={**start.points, **result.approximations.points})
-            numbered, earlier = number_reduced(network, start, given[0].by_elements), found
-            if (found := find_mismatches(numbered[0])).agrees(earlier):
-                break
         assert result is not None
         return result
 
     def agrees(self, result: Adjustment) -> bool:
         """Whether v'Pv is not significant."""
-        return result.redundancy < 1 or bool(chdtrc(result.redundancy, result.vpv) > self.family)
+        return result.redundancy < 1 or bool(chdtrc(result.redundancy, result.vpv) > self.options.probabilities.family)
 
     def solve_plainly(self, network: Network, start: Approximations | None) -> Adjustment | None:
         """Adjust a network in a few steps with the weights as given; None where the adjustment cannot start."""
@@ -390,31 +404,6 @@ class _Solver:
             return _Solver(replace(self.options.plain, iteration_limit=limit)).solve(network, start)
         except AdjustmentError:
             return None
-
-    def _start_robustly(self, network: Network, start: Approximations) -> Adjustment | None:
-        """Start robust estimation or data snooping without the given points that are blunders."""
-        # Returns None without such points or without convergence. From an adjustment that includes a blunder neither
-        # method recovers: the linearised equations do not hold for errors so large.
-        slips = self._slips(network, start) if self.options.robust or self.options.snooping else []
-        if not slips:
-            return None
-        _, freed = _free_points(network, start, slips)
-        try:
-            result = self.solve(network, freed, [slip.name for slip in slips])
-        except NoImageError:
-            return None
-        return result if result.converged else None
-
-    def _slips(self, network: Network, start: Approximations) -> "list[_FarPoint]":
-        """Find given points that contradict an adjustment without their coordinates significantly, with sentences."""
-        far = _far_points(number(network, start), self.family)
-        if not far:
-            return []
-        try:
-            without = self.solve(*_free_points(network, start, far), plain=True)
-            return _coordinate_slips(network, far, without, self.options)
-        except AdjustmentError:  # the adjustment cannot start without these points
-            return []
 
     def _begin_anew(self, network: Network, start: Approximations, stopped: Adjustment) -> Adjustment:
         """Adjust again from the network's own approximations; return `stopped` where these are no better."""
@@ -458,146 +447,160 @@ def _solve(
     return replace(result, network=network, values=values)
 
 
-def _without(network: Network, mismatches: Mismatches) -> tuple[Network, dict[int, tuple[int, ...]]]:
-    """Remove the points whose rays do not meet from a network; also return its doubted rows."""
-    out = np.concatenate([np.empty(0, dtype=np.intp), *mismatches.unmet.values()])
+def _without_mismatches(
+    network: Network, mismatches: Mismatches
+) -> tuple[Network, dict[int, tuple[int, ...]], dict[str, str]]:
+    """Remove the points whose rays do not meet from a network; also return its doubted rows, and sentences by point."""
+    unmet, images = mismatches.unmet, network.observations.image
+    out = np.concatenate([np.empty(0, dtype=np.intp), *unmet.values()])
     kept = np.setdiff1d(np.arange(len(network.observations)), out)
     doubted = {
         int(np.searchsorted(kept, row)): tuple(np.searchsorted(kept, others).tolist())
         for row, others in mismatches.doubted.items()
     }
-    if not len(out):
-        return network, doubted
-    points = tuple(point for point in network.points if point.id not in mismatches.unmet)
-    distances = tuple(each for each in network.distances if not {each.start, each.end} & mismatches.unmet.keys())
+    if not unmet:
+        return network, doubted, {}
+    points = tuple(point for point in network.points if point.id not in unmet)
+    distances = tuple(each for each in network.distances if not {each.start, each.end} & unmet.keys())
     rest = replace(network, points=points, observations=network.observations.only(kept), distances=distances)
-    return rest, doubted
+    sentences = {
+        name: f"No two rays of point {name} meet, from the images {shortened([images[row] for row in rows], NAMED)}: "
+        "the point is left out. Check its number there."
+        for name, rows in unmet.items()
+    }
+    return rest, doubted, sentences
 
 
-class _FarPoint(NamedTuple):
-    """Given point whose rays meet elsewhere."""
+def _leave_out_contradicting(
+    network: Network,
+    first: Adjustment,
+    adjusted: Callable[[Network], Adjustment],
+    agrees: Callable[[Adjustment], bool],
+    several: bool,
+) -> Adjustment:
+    """Leave out the frames that contradict the others, one after another, until these agree; `first` if they never do.
 
-    name: str  # id of the point
-    images: int  # number of images that show it
-    place: Array  # (3,) intersection of its rays, in object units
-    # median distance in the images of its marks from the projected given coordinates; inf behind the cameras
-    miss_mm: float
-    others_mm: float  # largest such distance of the other given points
-    sentence: str = ""  # where the point contradicts the observations significantly
-
-
-def _far_points(problem: Problem, family: float) -> list[_FarPoint]:
-    """Find given points that miss their marks by far more than all others, farthest first.
-
-    The orientations at the start of the adjustment are used: resections without the distortion, which is not known yet.
-    Therefore only a finite variance of the misses of good points is assumed. The largest of many is then more than
-    family^(-1/2) times as large as the next (10 times with 0.01) with the probability `family` at most, as holds for a
-    tail that falls with the square of the distance (the spacings of Pareto's distribution: B. C. Arnold, Pareto
-    Distributions, 1983). All points before the last such gap are far, if their rays meet. Empty where more than
-    MOST_FAR of the points are far.
+    Each has to dominate the residuals of its camera with all its marks. Where several may do so together, that one of
+    the TRIED worst is left out without which the residuals are smallest.
     """
-    rays, unknowns, rows = started_rays(problem), problem.unknowns, defaultdict[str, list[int]](list)
-    given = {id_: unknowns.given[at] for id_, at in unknowns.point.items() if np.isfinite(unknowns.sigma[at]).all()}
-    for row in np.flatnonzero(rays.scale_mm > 0.0).tolist():
-        rows[problem.network.observations.point[row]].append(row)
-    shown = {name: np.array(rows[name]) for name in sorted(given) if len(rows[name]) >= FEWEST_IMAGES}
-    if not shown:
-        return []
-    miss = {name: float(np.median(rays.misses_mm(own, given[name]))) for name, own in shown.items()}
-    falling = sorted(miss, key=lambda name: (-miss[name], name))
-    limits = [max(miss[name], rays.sigma_mm) / np.sqrt(family) for name in falling]  # for the points before each
-    gaps = [k for k in range(1, int(MOST_FAR * len(falling)) + 1) if miss[falling[k - 1]] > limits[k]]
-    found = []
-    for name in falling[: gaps[-1]] if gaps else ():
-        own = shown[name]
-        numbers = np.zeros(len(own), dtype=np.intp)
-        (place,), _ = intersect(rays.centers[own], rays.directions[own], numbers, np.full((1, 3), np.nan))
-        if (rays.misses_mm(own, place) < limits[gaps[-1]]).all():
-            found.append(_FarPoint(name, len(own), place, miss[name], miss[falling[gaps[-1]]]))
-    return found
+    most, out, last = MOST_CONTRADICTING * len({image.frame for image in network.images}), list[str](), first
+    while not agrees(last):
+        worst, trials = _frames_by_error(last, several)[: TRIED if several else 1], dict[str, Adjustment]()
+        for each in worst if len(out) + 1 <= most else ():
+            rest = _leave_out(network, [*out, each.name])
+            if rest is not None and (several or (each.share > CONTRADICTING and each.is_whole)):
+                with suppress(AdjustmentError):
+                    trials[each.name] = adjusted(rest)
+        if not trials:
+            return first
+        out.append(min(trials, key=lambda name: float(np.mean(trials[name].residuals.v_mm ** 2))))
+        last = trials[out[-1]]
+    return replace(last, left_out={**first.left_out, **last.left_out, **dict.fromkeys(out, _reason(first, last, out))})
 
 
-def _free_points(network: Network, start: Approximations, far: Sequence[_FarPoint]) -> tuple[Network, Approximations]:
-    """Remove the priors of far points from a network; start them where their rays meet."""
-    places = {each.name: each.place for each in far}
-
-    def freed(point: ObjectPoint) -> ObjectPoint:
-        return ObjectPoint(point.id, *(Prior(each.value, np.inf) for each in point.priors if each))
-
-    points = tuple(freed(point) if point.id in places else point for point in network.points)
-    return replace(network, points=points), replace(start, points={**start.points, **places})
+def _is_of_some_frames(result: Adjustment, camera: str) -> bool:
+    """Whether so many frames of a camera as may contradict the others have most of its errors."""
+    shares = [each.share for each in _frames_by_error(result, predicted=True) if each.camera == camera]
+    return sum(shares[: int(MOST_CONTRADICTING * len(shares))]) > CONTRADICTING
 
 
-def _coordinate_slips(
-    network: Network, far: Sequence[_FarPoint], without: Adjustment, options: Options
-) -> list[_FarPoint]:
-    """Select the far points that contradict an adjustment `without` their coordinates significantly, with sentences.
+class _FrameError(NamedTuple):
+    """Squared error of a frame and its share in that of its camera; whether it is of most of its marks."""
 
-    The quadratic form of the difference between given and adjusted coordinates is chi-square with 3 degrees of freedom.
-    The critical value holds for the maximum over all given points at the level `family`, and is multiplied by sigma0²
-    where that is larger than 1. Empty where that adjustment has no solution.
-    """
-    given, scale = network.known_places, max(without.sigma0, 1.0)
-    critical = float(options.probabilities.critical(np.array([3]), len(given))[0]) * scale**2
-    found = []
-    for each in far if without.converged else ():
-        at, point = without.run.problem.unknowns.point[each.name], network.point_by_id[each.name]
-        place, cofactor = without.values[at], without.cofactor.part(at)
-        variances = [prior.sigma**2 for prior in point.priors if prior]
-        weight: Array = np.asarray(np.linalg.inv(cofactor + np.diag(variances)), dtype=np.float64)
-
-        def passes(xyz: Array, place: Array = place, weight: Array = weight) -> bool:
-            return bool((xyz - place) @ weight @ (xyz - place) <= critical)
-
-        if not passes(given[each.name]):
-            sigma = scale * float(np.sqrt(np.diag(cofactor).max()))
-            found.append(each._replace(sentence=_sentence(each, place, sigma, given, passes)))
-    return found
+    square: float
+    name: str
+    camera: str
+    share: float
+    is_whole: bool
 
 
-def _sentence(
-    far: _FarPoint, place: Array, sigma: float, given: Mapping[str, Array], passes: Callable[[Array], bool]
-) -> str:
-    """Describe a blunder by the point's place (3,) without its given coordinates, and their difference from it."""
-    own = given[far.name]
-    off, digits = own - place, max(0, 1 - int(np.floor(np.log10(sigma))))
-    at = ", ".join(f"{axis} = {value:.{digits}f}" for axis, value in zip("XYZ", place, strict=True))
-    by = ", ".join(f"{axis} by {value:+.{digits}f}" for axis, value in zip("XYZ", off, strict=True))
-    missed = f"{far.miss_mm:.3g} mm from its marks" if np.isfinite(far.miss_mm) else "behind the camera"
-    # Clerical errors that explain the coordinates; told where there is exactly one.
-    readings = [
-        (own[[j if k == i else i if k == j else k for k in range(3)]], f"{'XYZ'[i]} and {'XYZ'[j]} look exchanged.")
-        for i, j in combinations(range(3), 2)
-    ]
-    readings += [(own * (1.0 - 2.0 * np.eye(3)[i]), f"The sign of {'XYZ'[i]} looks wrong.") for i in range(3)]
-    readings += [(xyz, f"It lies where point {id_} is given.") for id_, xyz in given.items() if id_ != far.name]
-    causes = [cause for xyz, cause in readings if passes(xyz)]
-    guess = f" {causes[0]}" if len(causes) == 1 else ""
+def _frames_by_error(result: Adjustment, predicted: bool) -> list[_FrameError]:
+    """Frames by their errors as the others predict them, or by their v'Pv, the largest first."""
+    network = result.network
+    camera_of = {image.frame: image.camera for image in network.images}
+    numbers, of_frame = np.unique(network.frame_numbers[network.image_numbers], return_inverse=True)
+    names, cameras = np.array([*camera_of.items()])[numbers].T
+    variances = np.diagonal(network.observations.covariance_mm2, axis1=1, axis2=2)
+    squares = (result.residuals.v_mm**2 / variances).sum(axis=1)  # without a solution no residual is standardised
+    of_others = result.prediction_errors(len(numbers)) if predicted else None
+    errors = np.bincount(of_frame, squares) if of_others is None else of_others
+    shares = errors / np.maximum((cameras[:, None] == cameras) @ errors, 1e-300)
+    medians = np.array([np.median(squares[of_frame == frame]) for frame in range(len(numbers))])
+    # Without a solution the worst mark is as large as any.
+    is_whole = np.full(len(numbers), not result.converged) | (medians >= 2.0 * WHOLE**2)
+    columns = (each.tolist() for each in (errors, names, cameras, shares, is_whole))
+    return sorted(map(_FrameError._make, zip(*columns, strict=True)), reverse=True)
+
+
+def _reason(first: Adjustment, last: Adjustment, frames: Sequence[str]) -> str:
+    """Sentence on frames without which the others agree, or the adjustment converges."""
+    who, shown = f"image{'s' * (len(frames) > 1)} {shortened(sorted(frames), NAMED)}", first.network.observations
+    if not first.converged:
+        own = np.isin(shown.image, frames)
+        row = int(np.argmax(np.where(own, np.linalg.norm(first.residuals.v_mm, axis=1), -1.0)))
+        return (
+            f"with {who} the iteration does not converge, without it does. The largest residual there is that of "
+            f"{shown.point[row]} in {shown.image[row]}. Check the point numbers."
+        )
+    falls = [first.unmodelled_mm[camera] / sigma_mm for camera, sigma_mm in last.unmodelled_mm.items() if sigma_mm]
+    times = f": unmodelled errors are {max(falls):.2g} times smaller then" if falls else ""
     return (
-        f"Control point {far.name} is not where it is given: its rays from {far.images} images meet at {at}, "
-        f"{np.linalg.norm(off):.{digits}f} away ({by}). What is given lies {missed} in the images, every other given "
-        f"point within {far.others_mm:.2g} mm.{guess} Correct its coordinates, or its number among the marks; with "
-        f"snooping = true the adjustment does without them."
+        f"all marks of {who} contradict the other images, which agree without them{times}. Possible are another size, "
+        "pitch, zoom or camera than given, a crop, another print of the board, or wrong point numbers."
     )
 
 
-def _unmet_sentences(network: Network, mismatches: Mismatches) -> dict[str, str]:
-    """Describe the points whose rays do not meet, by point."""
-    images, sentences = network.observations.image, dict[str, str]()
-    for name, rows in mismatches.unmet.items():
-        where = shortened([images[row] for row in rows], NAMED)
-        sentences[name] = (
-            f"No two rays of point {name} meet, from the images {where}: the point is left out. Check its number there."
+def _leave_out(network: Network, frames: Collection[str]) -> Network | None:
+    """Remove some frames and what only they show from a network; None where no more than half of it would remain."""
+    left = {image.frame for image in network.images if image.frame not in frames}
+    if len(left) <= len(frames):
+        return None
+    images, observations = tuple(image for image in network.images if image.frame in left), network.observations
+    names = {image.name for image in images}
+    shown = np.isin(observations.image, list(names))
+    frames_of = defaultdict[str, set[str]](set)
+    for row in np.flatnonzero(shown & ~observations.is_fiducial):
+        frames_of[observations.point[row]].add(network.image_by_name[observations.image[row]].frame)
+    located = {
+        point.id
+        for point in network.points
+        if len(frames_of[point.id]) >= (FEWEST_RAYS if point.X is point.Y is point.Z is None else 1)
+    }
+    kept = shown & (observations.is_fiducial | np.isin(observations.point, list(located)))
+    return replace(
+        network,
+        images=images,
+        points=tuple(
+            point for point in network.points if point.id in located or point.id not in network.observed_points
+        ),
+        observations=observations.only(np.flatnonzero(kept)),
+        distances=tuple(each for each in network.distances if {each.start, each.end} <= located | names),
+    )
+
+
+def _fitting(result: Adjustment, frames: Collection[str], sigma0: float) -> set[str]:
+    """Select the frames whose residuals agree with sigma0 of the others."""
+    of_mark = np.array([image.frame for image in result.network.images])[result.network.image_numbers]
+    excess = (np.nan_to_num(result.residuals.w) ** 2).sum(axis=1) - 2.0 * (FITTING * sigma0) ** 2
+    return {frame for frame in frames if (result.weights * excess)[of_mark == frame].sum() <= 0.0}
+
+
+def _adopt_lens(network: Network, result: Adjustment) -> Network:
+    """Replace the cameras of a network by those adjusted from a part of it."""
+
+    def adopted(camera: str, name: str, given: Prior | None) -> Prior:
+        return Prior(result.value(Parameter.interior(camera, name)), np.inf if given is None else given.sigma)
+
+    cameras = dict(network.camera_by_name)
+    for name in {image.camera for image in result.network.images} - result.network.idle_cameras:
+        camera, given = cameras[name], cameras[name].distortion.parameters
+        cameras[name] = replace(
+            camera,
+            principal_distance_mm=adopted(name, "c", camera.principal_distance_mm),
+            x0_mm=adopted(name, "x0", camera.x0_mm),
+            y0_mm=adopted(name, "y0", camera.y0_mm),
+            distortion=replace(
+                camera.distortion, parameters={each: adopted(name, each, prior) for each, prior in given.items()}
+            ),
         )
-    return sentences
-
-
-def _few_points(network: Network) -> list[str]:
-    """Remark on an adjustment without a solution where too few points are given to check each other."""
-    named = sorted(name for name in network.known_places if name in network.observed_points)
-    if len(named) != ENOUGH - 1:
-        return []
-    return [
-        f"The points {', '.join(named)} alone are given in X, Y and Z: if the coordinates of one of the {len(named)} "
-        f"are wrong, nothing tells which. Check all of them, or give another point."
-    ]
+    return replace(network, cameras=tuple(cameras.values()))

@@ -16,7 +16,7 @@ import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import chain, combinations, product
 from typing import NamedTuple
 
@@ -113,18 +113,12 @@ def network_hypotheses(network: Network, bare: Network, given: Adjustment | None
     is_far = given is None or not given.converged or given.sigma0 > ONE_AXIS
     exchanged, mirrored_images = _exchanged_frames(network, given), _mirrored_images(network)
     heights = _one_axis(network, (2,)) if is_far else ()  # before distances, of which one may do the same
-    plane = _one_axis(network, (0, 1)) if is_far and _may_be_stretched(network, given) else ()
+    # With any units of the axes linear transformations of the given points fit all images, but the adjustment does not.
+    large_mm = LARGE * np.ptp(network.observations.xy_mm)
+    misses = given is None or not given.converged or np.sqrt(np.mean(given.residuals.v_mm**2)) > large_mm
+    is_stretched = is_far and misses and all(each.misfit < LARGE for each in _transformed_fields(network))
+    plane = _one_axis(network, (0, 1)) if is_stretched else ()
     yield from ([each] for each in chain(exchanged, heights, mirrored_images, _distances(network), plane))
-
-
-def _may_be_stretched(network: Network, given: Adjustment | None) -> bool:
-    """Whether linear transformations of the given points fit all images, as with any units of the axes, and the
-    adjustment as given misses the marks by as much as a wrong one makes it."""
-    if given is not None and given.converged:
-        miss_mm = np.sqrt(np.mean(given.residuals.v_mm**2))
-        if miss_mm <= LARGE * np.ptp(network.observations.xy_mm):
-            return False
-    return all(each.misfit < LARGE for each in _transformed_fields(network))
 
 
 def _one_axis(network: Network, axes: Sequence[int]) -> Iterator[NetworkHypothesis]:
@@ -204,26 +198,22 @@ def mirrored_images(network: Network, names: Sequence[str]) -> Network:
 
     The axis is the centre of the image where its size is known, else that of all marks of the camera.
     """
-    middle = {camera.name: _middle_mm(network, camera) for camera in network.cameras}
+    middle, of_image = dict[str, float](), np.array([image.camera for image in network.images])
+    for camera in network.cameras:
+        x_mm = network.observations.xy_mm[(of_image == camera.name)[network.image_numbers], 0]
+        own = float(x_mm.min() + x_mm.max()) / 2.0 if len(x_mm) else 0.0
+        if len(x_mm) and camera.frame_mm[0]:
+            half = camera.frame_mm[0] / 2.0
+            own = half if abs(own - half) < abs(own) else 0.0
+        elif len(x_mm) and camera.x0_mm is not None:
+            own = camera.x0_mm.value
+        middle[camera.name] = own
     turned = np.array([image.name in names and image.transformation == "none" for image in network.images])
     centers = np.array([middle[image.camera] for image in network.images])[network.image_numbers]
     xy_mm = network.observations.xy_mm.copy()
     is_turned = turned[network.image_numbers]
     xy_mm[is_turned, 0] = 2.0 * centers[is_turned] - xy_mm[is_turned, 0]
     return replace(network, observations=replace(network.observations, xy_mm=xy_mm))
-
-
-def _middle_mm(network: Network, camera: Camera) -> float:
-    """Centre of the camera's images in x, mm."""
-    own = [image.camera == camera.name for image in network.images]
-    x_mm = network.observations.xy_mm[np.array(own)[network.image_numbers], 0]
-    if not len(x_mm):
-        return 0.0
-    middle = float(x_mm.min() + x_mm.max()) / 2.0
-    if not camera.frame_mm[0]:
-        return middle if camera.x0_mm is None else camera.x0_mm.value
-    half = camera.frame_mm[0] / 2.0
-    return half if abs(middle - half) < abs(middle) else 0.0
 
 
 def _distances(network: Network) -> Iterator[NetworkHypothesis]:
@@ -276,7 +266,8 @@ def blunder_sentence(network: Network, given: Adjustment | None, trials: Trials)
     if trials.explains(given):
         return ""
     bare = replace(network, images=tuple(replace(image, exterior=None) for image in network.images))
-    if _given_stations(network):
+    stations = _given_stations(network)
+    if stations:
         alone = trials.adjust(bare)
         if alone is not None and trials.explains(alone):
             return stations_elsewhere(network, alone)
@@ -284,7 +275,11 @@ def blunder_sentence(network: Network, given: Adjustment | None, trials: Trials)
         found = trials.adjust(alike[0].network)
         better = found is not None and (given is None or CLEARLY * found.sigma0 < given.sigma0 or not given.converged)
         if found is not None and better and trials.explains(found):
-            return _sentence(_as_stations_are_given(network, alike, found), found, given, trials.family)
+            if len(alike) > 1 and stations:  # those whose stations lie near the given ones; all if none does
+                adjusted, depths, places = _stations(found, stations)
+                unmoved = adjusted @ np.linalg.inv(alike[0].moved).T
+                alike = [each for each in alike if _near(unmoved @ each.moved.T, places, depths).all()] or alike
+            return _sentence(alike, found, given, trials.family)
     return ""
 
 
@@ -313,18 +308,6 @@ def _found_distance(camera: str, given_mm: float, found: Adjustment) -> str:
     is_unit = any(abs(times / each - 1.0) < ROUND for each in PITCHES)
     why = f", so that it is given {times:.3g} times too {how}: another unit, or a wrong pitch_um" if is_unit else ""
     return f": it is found as {c:.6g} mm{why}"
-
-
-def _as_stations_are_given(
-    network: Network, alike: Sequence[NetworkHypothesis], found: Adjustment
-) -> Sequence[NetworkHypothesis]:
-    """Keep the hypotheses with identical residuals whose stations lie near the given ones; all if none does."""
-    given = _given_stations(network)
-    if len(alike) == 1 or not given:
-        return alike
-    stations, depths, places = _stations(found, given)
-    unmoved = stations @ np.linalg.inv(alike[0].moved).T
-    return [each for each in alike if _near(unmoved @ each.moved.T, places, depths).all()] or alike
 
 
 def _given_stations(network: Network) -> dict[str, Array]:
@@ -394,61 +377,51 @@ def check_plausibility(result: Adjustment, trials: Trials) -> Adjustment:
     return replace(result, misread=misread, remarks=(*result.remarks, *remarks))
 
 
-@dataclass(frozen=True)
-class _CameraMarks:
+class _CameraView(NamedTuple):
     """Object points in the images of one camera.
 
-    rows: rows of the observations; xy_mm (n, 2): camera coordinates; digital: whether its images have no film
-    transformation.
+    digital: whether its images have no film transformation; xy_mm (n, 2): camera coordinates; picture (2, 2): image
+    area in mm, by two opposite corners, None where its size is unknown; outside: rows of the marks outside it.
     """
 
     camera: Camera
     digital: bool
-    rows: Indices
     xy_mm: Array
+    picture: Array | None
+    outside: list[int]
 
-    @cached_property
-    def picture(self) -> Array | None:
-        """Image area in mm, by two opposite corners (2, 2); None where its size is unknown.
 
-        That of a digital camera starts at the first pixel, like the comparator coordinates. That of a film camera is
-        centred on the fiducial marks. It is centred on the origin where nearly all marks lie inside then, and more than
-        otherwise.
-        """
-        size = np.array(self.camera.frame_mm)
-        if not size.all():
-            return None
-        marks = [[mark.x_mm.value, mark.y_mm.value] for mark in self.camera.fiducials.values()]
-        middle_mm = (np.min(marks, axis=0) + np.max(marks, axis=0)) / 2.0 if marks else np.zeros(2)
-        low = size * [0.0, -1.0] if self.digital else middle_mm - size / 2.0
-        usual, middle = np.array([low, low + size]), np.array([-size / 2.0, size / 2.0])
-        outside = _is_outside(middle, self.xy_mm).mean()
-        return middle if outside < min(1.0 - NEARLY_ALL, _is_outside(usual, self.xy_mm).mean()) else usual
-
-    @property
-    def outside(self) -> list[int]:
-        """Rows of the marks outside the image area.
-
-        For a digital camera of unknown size these are all rows, if all marks lie above and right of the first pixel.
-        """
-        if self.picture is not None:
-            return [int(row) for row in self.rows[_is_outside(self.picture, self.xy_mm)]]
-        return self.rows.tolist() if self.digital and (self.xy_mm > 0.0).all() else []
+def _views(result: Adjustment) -> list[_CameraView]:
+    """Views of the cameras whose images show object points."""
+    in_camera_mm, images = observed_in_camera(result.run.problem, result.run.end.state), result.network.images
+    films, found = {image.camera for image in images if image.transformation != "none"}, list[_CameraView]()
+    for name, rows in result.run.problem.targets_by_camera.items():
+        if not len(rows):
+            continue
+        camera, digital, xy_mm = result.network.camera_by_name[name], name not in films, in_camera_mm[rows]
+        size = np.array(camera.frame_mm)
+        picture: Array | None = None
+        # Of unknown size, all marks of a digital camera are outside if they lie above and right of the first pixel.
+        outside = rows if digital and (xy_mm > 0.0).all() else rows[:0]
+        if size.all():
+            # The image area of a digital camera starts at the first pixel, like the comparator coordinates. That of a
+            # film camera is centred on the fiducial marks. It is centred on the origin where nearly all marks lie
+            # inside then, and more than otherwise.
+            marks = [[mark.x_mm.value, mark.y_mm.value] for mark in camera.fiducials.values()]
+            middle_mm = (np.min(marks, axis=0) + np.max(marks, axis=0)) / 2.0 if marks else np.zeros(2)
+            low = size * [0.0, -1.0] if digital else middle_mm - size / 2.0
+            picture, centred = np.array([low, low + size]), np.array([-size / 2.0, size / 2.0])
+            if _is_outside(centred, xy_mm).mean() < min(1.0 - NEARLY_ALL, _is_outside(picture, xy_mm).mean()):
+                picture = centred
+            outside = rows[_is_outside(picture, xy_mm)]
+        found.append(_CameraView(camera, digital, xy_mm, picture, outside.tolist()))
+    return found
 
 
 def _is_outside(picture: Array, xy_mm: Array) -> Mask:
     """Mask of points (n, 2) outside an image area."""
     margin = MARGIN * float(np.ptp(picture, axis=0).max())
     return np.asarray(((xy_mm < picture[0] - margin) | (xy_mm > picture[1] + margin)).any(axis=1))
-
-
-def _views(result: Adjustment) -> list[_CameraMarks]:
-    """Views of the cameras whose images show object points."""
-    xy_mm, images = observed_in_camera(result.run.problem, result.run.end.state), result.network.images
-    films = {image.camera for image in images if image.transformation != "none"}
-    of_camera = result.network.camera_by_name
-    targets = result.run.problem.targets_by_camera.items()
-    return [_CameraMarks(of_camera[name], name not in films, rows, xy_mm[rows]) for name, rows in targets if len(rows)]
 
 
 def _marks_outside(result: Adjustment, rows: Sequence[int], trials: Trials) -> Iterator[str]:
@@ -520,7 +493,7 @@ def _sides(result: Adjustment) -> dict[str, float]:
     return {name: side for name, side in shown.items() if name not in network.objectless_images}
 
 
-def _principal_point(view: _CameraMarks, result: Adjustment, family: float) -> Iterator[str]:
+def _principal_point(view: _CameraView, result: Adjustment, family: float) -> Iterator[str]:
     name, picture, kind = view.camera.name, view.picture, "outside the picture"
     at = result.run.problem.unknowns.camera[name][1:3]
     found = result.values[at]

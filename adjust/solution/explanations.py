@@ -33,12 +33,13 @@ from scipy.special import chdtr, chdtrc, fdtrc, ndtr
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.problem.problem import Problem
+from adjust.quality.cofactor import free_cofactor
 from adjust.quality.critical_values import Probabilities
 from adjust.quality.reliability import TOLD_APART, Snooping
 from adjust.quality.run import UM_PER_MM, GrossError, Run, residuals
 from adjust.quality.variance_components import added_variance, refined_factors
 from adjust.rank_defect.diagnosis import singular_directions
-from adjust.solution.model_hypotheses import ModelHypothesis, estimate, model_hypotheses, separate_lenses
+from adjust.solution.model_hypotheses import Estimate, ModelHypothesis, continued, model_hypotheses
 from adjust.solution.reweighting import again
 
 LEVEL = 0.001  # probability of reporting anything where the model is correct
@@ -86,7 +87,7 @@ def explain(
     There are none where the adjustment has no solution. unmodelled: share of the variance of the marks that was
     estimated from the residuals.
     """
-    if not (run.converged and run.is_tested and redundancy >= CHECKED):
+    if not run.converged or redundancy < CHECKED:
         return (), run
     first = last = _Model(run, redundancy, probabilities, unmodelled)
     found: list[Explanation] = []
@@ -97,9 +98,10 @@ def explain(
         found += [_model_explanation(each, last) for each in alike]
         if not alike or has_rival:
             break
-        following = _following(alike[0]) if len(alike) == 1 else None
-        last = following or alike[0]
-        if following is None or last.kind in ("groups", "distances"):
+        last = alike[0]
+        if len(alike) == 1 and last.kind == "groups":
+            last = _with_separate_lenses(last) or last
+        if len(alike) > 1 or last.kind in ("groups", "distances"):
             break
     noises = (_added_noise(last.run, last.redundancy), _wide_control(last.run)) if last.exceeds(LEVEL) else ()
     for words, with_noise, widened in filter(None, noises):
@@ -196,30 +198,28 @@ class _Model:
         variance = (self.vpv - fall) / left
         return float(fdtrc(count, left, fall / (count * variance)) if variance > 1.0 else chdtrc(count, fall))
 
-    def improves(self, simpler: "_Model", level: float) -> bool:
-        """Whether the hypothesis is significant in a simpler model by the actual decrease of v'Pv.
-
-        Beside gross errors that it leaves, it has to be so without them.
-        """
-        if self.hypothesis is None or not simpler.is_significant(self.hypothesis, simpler.vpv - self.vpv, level):
-            return False
-        is_rid = len(self.gross_errors) < len(simpler.gross_errors) or not simpler.gross_errors
-        return is_rid or simpler.probability(self.hypothesis, simpler.rest[0] - self.rest[0]) < level
-
     def adjusted(self, problem: Problem) -> Run | None:
         """Adjust a larger problem from its start with the same weights; None without a solution."""
         larger = again(replace(self.run, problem=problem), self.run.weighting, STEPS, problem.start())
-        return larger if larger.converged and larger.is_tested else None
+        return larger if larger.converged else None
 
-    def extended(self, hypothesis: ModelHypothesis) -> "_Model | None":
-        """Add a hypothesis to the model; None without a solution within its limits."""
+    def extended(self, hypothesis: ModelHypothesis, level: float) -> "_Model | None":
+        """Add a hypothesis to the model; None without a solution within its limits, or where it is not significant.
+
+        It is tested by the actual decrease of v'Pv, and beside gross errors that it leaves also without them.
+        """
         run, (low, high) = self.adjusted(hypothesis.problem), hypothesis.limits
         values = None if run is None else run.end.state.values[hypothesis.added]
         if run is None or values is None or not ((values >= low) & (values <= high)).all():
             return None
-        p = self.probability(hypothesis, self.vpv - run.end.vpv)
+        fall = self.vpv - run.end.vpv
+        if not self.is_significant(hypothesis, fall, level):
+            return None
         left, has_suspects = self.redundancy - len(hypothesis.added), bool(self.gross_errors)
-        return _Model(run, left, self.probabilities, self.unmodelled, has_suspects, hypothesis, p)
+        p = self.probability(hypothesis, fall)
+        larger = _Model(run, left, self.probabilities, self.unmodelled, has_suspects, hypothesis, p)
+        is_rid = not self.gross_errors or len(larger.gross_errors) < len(self.gross_errors)
+        return larger if is_rid or self.probability(hypothesis, self.rest[0] - larger.rest[0]) < level else None
 
 
 def _best(model: _Model) -> tuple[list[_Model], bool]:
@@ -227,18 +227,27 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
     # Also returns whether gross errors of single observations explain the residuals as well.
     is_suspicious = model.exceeds(SUSPECTED) or bool(model.gross_errors)
     tested = {board.name for board in model.run.problem.network.boards}
-    rows = model_hypotheses(model.run, is_suspicious, bool(model.unmodelled))
-    falls = [(_first_order_fall(model.run, each.problem), each) for each in rows if each.name not in tested]
+    falls = list[tuple[float, ModelHypothesis]]()
+    for each in model_hypotheses(model.run, is_suspicious, bool(model.unmodelled)):
+        if each.name not in tested:
+            at = model.run.linearised(each.problem)
+            is_regular = at is not None and not singular_directions(at.rows.numbering, at.state, at.factor)
+            falls.append((at.factor.length() ** 2 if at is not None and is_regular else 0.0, each))
     level = LEVEL / max(len(falls), 1)
     worth = WORTH * max((fall for fall, _ in falls), default=0.0)
     likely = [(fall, each) for fall, each in falls if fall > worth and model.is_significant(each, fall, level, WORTH)]
     likely.sort(key=lambda each: -each[0])
-    candidates = [model.extended(each) for _, each in likely[:MOST_ADJUSTED]]
-    found = [each for each in candidates if each is not None and each.improves(model, level)]
+    candidates = [model.extended(each, level) for _, each in likely[:MOST_ADJUSTED]]
+    found = [each for each in candidates if each is not None]
     if not found:
         return [], False
     variance = max(1.0, min(each.rest[0] / each.rest[1] for each in (model, *found)))
-    found = _without_nested(found, variance)
+    # A drift and groups of images stay, or a distance of each image's own if it explains significantly more.
+    pairs = [(one, other) for one, other in product(found, found) if one.kind == "distances" and other.kind in SPECIAL]
+    further = [(s.redundancy - g.redundancy, max(0.0, s.vpv - g.vpv) / variance) for g, s in pairs]
+    is_needless = any(chdtrc(count, fall) > LEVEL for count, fall in further)
+    dropped = ("distances",) if is_needless else SPECIAL if further else ()
+    found = [each for each in found if each.kind not in dropped]
     criteria = [each.criterion(variance) + each.costs for each in found]
     without = model.criterion(variance) - min(criteria) if model.gross_errors else np.inf
     if without < -TOLD_APART:
@@ -247,28 +256,18 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
     return alike, bool(without < TOLD_APART)
 
 
-def _without_nested(found: list[_Model], variance: float) -> list[_Model]:
-    """Keep a drift and groups of images, or a distance of each image's own if it explains significantly more."""
-    pairs = [(one, other) for one, other in product(found, found) if one.kind == "distances" and other.kind in SPECIAL]
-    further = [(s.redundancy - g.redundancy, max(0.0, s.vpv - g.vpv) / variance) for g, s in pairs]
-    is_needless = any(chdtrc(count, fall) > LEVEL for count, fall in further)
-    dropped = ("distances",) if is_needless else SPECIAL if further else ()
-    return [each for each in found if each.kind not in dropped]
-
-
-def _first_order_fall(run: Run, problem: Problem) -> float:
-    """First-order decrease of v'Pv in a larger problem; 0 where it is singular."""
-    at = run.linearised(problem)
-    is_regular = at is not None and not singular_directions(at.rows.numbering, at.state, at.factor)
-    return at.factor.length() ** 2 if at is not None and is_regular else 0.0
-
-
-def _following(model: _Model) -> _Model | None:
-    """Return the adjustment for the next round: groups of images get separate lenses; None without a solution."""
-    if model.kind not in ("groups", "distances"):
-        return model
-    problem = separate_lenses(model.run) if model.kind == "groups" else None
-    run = None if problem is None else model.adjusted(problem)
+def _with_separate_lenses(model: _Model) -> _Model | None:
+    """Give two groups of images entirely separate lenses; None without a solution, or with fiducial marks."""
+    network = model.run.problem.network
+    if any(camera.fiducials for camera in network.cameras):
+        return None
+    problem, old = continued(model.run, network), model.run.problem.unknowns
+    unknowns = problem.unknowns
+    sigma, start = unknowns.sigma.copy(), unknowns.start.copy()
+    for name, at in old.camera.items():
+        own = unknowns.camera[name]
+        sigma[own], start[own] = old.sigma[at], model.run.end.state.values[at]
+    run = model.adjusted(replace(problem, unknowns=replace(unknowns, sigma=sigma, start=start)))
     if run is None:
         return None
     added = len(run.numbering.free) - len(model.run.numbering.free)
@@ -276,13 +275,20 @@ def _following(model: _Model) -> _Model | None:
 
 
 def _model_explanation(larger: _Model, model: _Model) -> Explanation:
+    """Describe a hypothesis by the estimates of its unknowns in the adjustment that includes them."""
     assert larger.hypothesis is not None
-    hypothesis, coordinates = larger.hypothesis, 2 * len(model.run.end.v_mm)
-    covariance = model.run.problem.network.observations.covariance_mm2
-    sigma_um = UM_PER_MM * float(np.sqrt(np.mean(np.trace(covariance, axis1=1, axis2=2)) / 2.0))
+    hypothesis, run, coordinates = larger.hypothesis, larger.run, 2 * len(model.run.end.v_mm)
+    covariance_mm2 = model.run.problem.network.observations.covariance_mm2
+    sigma_um = UM_PER_MM * float(np.sqrt(np.mean(np.trace(covariance_mm2, axis1=1, axis2=2)) / 2.0))
     explained_um = sigma_um * float(np.sqrt(max(model.vpv - larger.vpv, 0.0) / coordinates))
-    words = hypothesis.words(estimate(larger.run, hypothesis, explained_um))
-    return _explanation(hypothesis.kind, words, larger.p, model, larger)
+    # The covariance is scaled by the variance factor of the larger model where that exceeds 1: what it leaves
+    # unexplained is noise to its unknowns.
+    vpv, redundancy = run.group_sums(run.weighting.used)
+    variance = max(vpv / redundancy, 1.0) if redundancy >= 1.0 else 1.0
+    positions = hypothesis.added if hypothesis.shown is None else hypothesis.shown
+    covariance = variance * free_cofactor(run.end).part(positions)
+    estimate = Estimate(run.end.state.values[positions], np.sqrt(np.diag(covariance)), covariance, explained_um)
+    return _explanation(hypothesis.kind, hypothesis.words(estimate), larger.p, model, larger)
 
 
 def _explanation(kind: str, words: tuple[str, str], p: float, without: _Model, larger: _Model) -> Explanation:
@@ -292,7 +298,12 @@ def _explanation(kind: str, words: tuple[str, str], p: float, without: _Model, l
     return Explanation(kind, f"{words[0]}; {figures}.", words[1], p, sigma0)
 
 
-KINDS = (("marks", ("target", "tie", "fiducial")), ("targets", ("target", "tie")), ("fiducials", ("fiducial",)))
+# Marks, their kinds, and the key of their standard deviation in a project.
+KINDS = (
+    ("marks", ("target", "tie", "fiducial"), "sigma_target_um"),
+    ("targets", ("target", "tie"), "sigma_target_um"),
+    ("fiducials", ("fiducial",), "sigma_fiducial_um"),
+)
 
 
 # Cause and remedy, the adjustment with it, and the change of minus twice the logarithm of the likelihood beside v'Pv.
@@ -307,7 +318,7 @@ def _added_noise(run: Run, redundancy: int) -> Noise | None:
     kind, covariance = np.array(network.observations.kind), network.observations.covariance_mm2
     variances, axes = np.linalg.eigh(covariance / run.weighting.weights[: len(v_mm), None, None])
     squares = np.einsum("nij,ni->nj", axes, v_mm) ** 2
-    for marks, kinds in KINDS:
+    for marks, kinds, key in KINDS:
         members = np.isin(kind, kinds)
         if marks != "marks" and members.all():
             continue
@@ -319,10 +330,19 @@ def _added_noise(run: Run, redundancy: int) -> Noise | None:
         observations = replace(network.observations, covariance_mm2=larger)
         problem = replace(run.problem, network=replace(network, observations=observations))
         noisy = again(replace(run, problem=problem), run.weighting, STEPS, run.end.state)
-        if noisy.converged and noisy.is_tested and _groups_agree(noisy):
+        if noisy.converged and _groups_agree(noisy):
             share = run.redundancies[: len(v_mm)][members].mean()
             widened = float(share * np.log1p(added / variances[members]).sum())
-            return _noise_words(marks, UM_PER_MM * float(np.sqrt(added)), covariance), noisy, widened
+            added_um = UM_PER_MM * float(np.sqrt(added))
+            given_um = UM_PER_MM * float(np.sqrt(np.median(np.trace(covariance, axis1=1, axis2=2) / 2.0)))
+            words = (
+                f"The standard deviations given to the {marks} are too small everywhere: the residuals are plain "
+                f"noise, alike in all images; {added_um:.3g} µm added to the {given_um:.3g} µm given (in quadrature) "
+                "explains all",
+                f"Give film_sigma_um = {added_um:.3g} under [adjust], which is added to the sigma of every mark, or "
+                f"larger sigmas in comparator.csv or {key}.",
+            )
+            return words, noisy, widened
     return None
 
 
@@ -334,7 +354,7 @@ def _wide_control(run: Run) -> Noise | None:
     wide = replace(run, weighting=replace(run.weighting, factors={"control": 1.0}))
     for _ in range(TURNS):
         wide = again(wide, refined_factors(wide), STEPS)
-        if not (wide.converged and wide.is_tested):
+        if not wide.converged:
             return None
     if not (_is_noise(wide) and _groups_agree(wide)):
         return None
@@ -348,37 +368,27 @@ def _wide_control(run: Run) -> Noise | None:
     return words, wide, freedom * float(np.log(factor))
 
 
-def _noise_words(marks: str, added_um: float, covariance_mm2: Array) -> tuple[str, str]:
-    given_um = UM_PER_MM * float(np.sqrt(np.median(np.trace(covariance_mm2, axis1=1, axis2=2) / 2.0)))
-    key = "sigma_fiducial_um" if marks == "fiducials" else "sigma_target_um"
-    return (
-        f"The standard deviations given to the {marks} are too small everywhere: the residuals are plain "
-        f"noise, alike in all images; {added_um:.3g} µm added to the {given_um:.3g} µm given (in quadrature) "
-        "explains all",
-        f"Give film_sigma_um = {added_um:.3g} under [adjust], which is added to the sigma of every mark, or larger "
-        f"sigmas in comparator.csv or {key}.",
-    )
-
-
 def _is_noise(run: Run) -> bool:
     """Whether standardised residuals are homogeneous over images and independent of neighbours."""
     v = residuals(run)
     checked: Mask = np.asarray((v.redundancy > UNCHECKED).all(axis=1))
     if 2 * checked.sum() < FEWEST:
         return False
-    w, images = v.w[checked], run.problem.image_numbers[checked]
-    return _is_alike(w, v.redundancy[checked], images) and not any(
-        _is_positive(products) for products in _neighbour_products(run, checked, w, images)
-    )
-
-
-def _is_alike(w: Array, redundancy: Array, images: Indices) -> bool:
-    """Test by chi-square whether all images have the same mean square."""
+    w, redundancy, images = v.w[checked], v.redundancy[checked], run.problem.image_numbers[checked]
+    # All images have the same mean square: chi-square test.
     shares, freedom = (np.bincount(images, each.sum(axis=1)) for each in (w**2 * redundancy, redundancy))
     present = freedom > 1.0
     variance = shares.sum() / freedom.sum()
     square = ((shares[present] / variance - freedom[present]) ** 2 / (2.0 * freedom[present])).sum()
-    return bool(present.sum() < 2 or chdtrc(present.sum() - 1, square) > CHANCE)
+    if present.sum() >= 2 and chdtrc(present.sum() - 1, square) <= CHANCE:
+        return False
+    # Sums of products of residuals, of expectation 0 if independent, are not significantly positive.
+    for products in _neighbour_products(run, checked, w, images):
+        if len(products) > 2:
+            z = products.sum() / np.sqrt(2.0 * (products**2).sum())  # factor 2: most pairs of neighbours occur twice
+            if ndtr(-z) < 0.5 * CHANCE:
+                return False
+    return True
 
 
 def _neighbour_products(run: Run, checked: Mask, w: Array, images: Indices) -> Iterator[Array]:
@@ -398,14 +408,6 @@ def _neighbour_products(run: Run, checked: Mask, w: Array, images: Indices) -> I
     order = np.lexsort((images, points))
     in_object = np.einsum("nji,nj->ni", run.end.state.rotations[images][:, :2], w)[order]
     yield (in_object[1:] * in_object[:-1]).sum(axis=1)[points[order][1:] == points[order][:-1]]
-
-
-def _is_positive(products: Array) -> bool:
-    """Whether the sum of products of residuals, of expectation 0 if independent, is significantly positive."""
-    if len(products) <= 2:
-        return False
-    z = products.sum() / np.sqrt(2.0 * (products**2).sum())  # factor 2: most pairs of neighbours occur twice
-    return bool(ndtr(-z) < 0.5 * CHANCE)
 
 
 def _groups_agree(run: Run) -> bool:

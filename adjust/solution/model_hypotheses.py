@@ -112,17 +112,6 @@ def model_hypotheses(run: Run, is_suspicious: bool, is_fitted: bool) -> Iterator
         yield from _wrong_points(run, 1 if is_fitted else len(network.points))
 
 
-def estimate(run: Run, hypothesis: ModelHypothesis, rms_um: float) -> Estimate:
-    """Estimate the unknowns that the words of a hypothesis tell, from the adjustment that includes them."""
-    # The covariance is scaled by the variance factor of the extended model where that exceeds 1: what it leaves
-    # unexplained is noise to its unknowns.
-    positions = hypothesis.added if hypothesis.shown is None else hypothesis.shown
-    vpv, redundancy = run.group_sums(run.weighting.used)
-    variance = max(vpv / redundancy, 1.0) if redundancy >= 1.0 else 1.0
-    covariance = variance * free_cofactor(run.end).part(positions)
-    return Estimate(run.end.state.values[positions], np.sqrt(np.diag(covariance)), covariance, rms_um)
-
-
 def displaced(run: Run, name: str, kind: str, words: Words, directions: Array) -> ModelHypothesis:
     """Add displacements (n, k, 3) of the targets' points as unknowns."""
     network = run.problem.network
@@ -131,70 +120,40 @@ def displaced(run: Run, name: str, kind: str, words: Words, directions: Array) -
     return ModelHypothesis(kind, words, problem, problem.unknowns.board[name], name=name)
 
 
-def separate_lenses(run: Run) -> Problem | None:
-    """Give the two groups of images entirely separate lenses; None where cameras have fiducial marks."""
-    network = run.problem.network
-    if any(camera.fiducials for camera in network.cameras):
-        return None
-    problem = continued(run, network)
-    unknowns, old = problem.unknowns, run.problem.unknowns
-    sigma, start = unknowns.sigma.copy(), unknowns.start.copy()
-    for name, at in old.camera.items():
-        sigma[unknowns.camera[name]], start[unknowns.camera[name]] = old.sigma[at], run.end.state.values[at]
-    return replace(problem, unknowns=replace(unknowns, sigma=sigma, start=start))
-
-
 def continued_with(run: Run, positions: Indices) -> Problem:
     """Free some quantities of a problem; start where an adjustment ended."""
     return freed(continued(run, run.problem.network), positions)
 
 
-def continued(run: Run, network: Network, like: Mapping[str, str] | None = None, apart: int = 0) -> Problem:
-    """Number a network with additional unknowns; start where an adjustment ended, in its datum."""
-    # like: cameras that share all but the first `apart` quantities, of c, x0, y0, with another one and start with its.
-    old, values, like = run.problem.unknowns, run.end.state.values, like or {}
-    mirrored = run.problem.mirrored
+def continued(run: Run, network: Network, like: Mapping[str, str] | None = None) -> Problem:
+    """Number a network with additional unknowns; start where an adjustment ended, in its datum.
+
+    like: additional cameras, with those whose interior orientation they start with.
+    """
+    old, values, mirrored = run.problem.unknowns, run.end.state.values, run.problem.mirrored
     interior = {name: values[at[: len(INTERIOR_NAMES)]] for name, at in old.camera.items()}
-    before = {image.name: image.transformation for image in run.problem.network.images}
+    transformation = dict[str, Array]()
+    for image, before in zip(network.images, run.problem.network.images, strict=True):
+        parameters = values[old.transformation[image.name]]
+        if image.transformation != before.transformation:  # the kind before is a special case of it
+            places = film_kind(before.transformation, image.name in mirrored).apply(parameters, LATTICE)
+            parameters, _ = fit_transformation(image.transformation, LATTICE, places)
+        transformation[image.name] = parameters
     state = Approximations(
-        interior=interior | {name: interior[other] for name, other in like.items()},
+        interior=interior | {name: interior[other] for name, other in (like or {}).items()},
         exterior={image.name: values[old.exterior[image.name]] for image in network.images},
-        transformation={
-            image.name: _in_kind(
-                image.transformation, before[image.name], values[old.transformation[image.name]], image.name in mirrored
-            )
-            for image in network.images
-        },
+        transformation=transformation,
         points={id_: values[at] for id_, at in old.point.items()},
         mirrored=mirrored,
         joins={key: values[at] for key, at in old.join.items()},
     )
     problem = number(network, state, run.problem.by_elements)
-    unknowns = problem.unknowns
-    position = {parameter: i for i, parameter in enumerate(old.parameters)}
+    unknowns, position = problem.unknowns, {parameter: i for i, parameter in enumerate(old.parameters)}
     new = np.array([i for i, parameter in enumerate(unknowns.parameters) if parameter in position], dtype=np.intp)
     at = np.array([position[unknowns.parameters[i]] for i in new], dtype=np.intp)
     given, sigma, start = unknowns.given.copy(), unknowns.sigma.copy(), unknowns.start.copy()
     given[new], sigma[new], start[new] = old.given[at], old.sigma[at], values[at]
-    camera, fiducial = dict(unknowns.camera), dict(unknowns.fiducial)
-    for name, other in like.items():
-        free, own = camera[name][:apart], camera[other]
-        given[free], sigma[free], start[free] = np.nan, np.inf, start[own[:apart]]
-        sigma[camera[name][apart:]] = 0.0
-        camera[name] = np.concatenate([free, own[apart:]])
-        for (owner, id_), pair in unknowns.fiducial.items():
-            if owner == name:
-                sigma[pair] = 0.0
-                fiducial[name, id_] = fiducial[other, id_]
-    shared = replace(unknowns, given=given, sigma=sigma, start=start, camera=camera, fiducial=fiducial)
-    return replace(problem, unknowns=shared)
-
-
-def _in_kind(kind: Transformation, old: Transformation, parameters: Array, is_mirrored: bool) -> Array:
-    """Parameters of a film transformation in a kind that contains it."""
-    if kind == old:
-        return parameters
-    return fit_transformation(kind, LATTICE, film_kind(old, is_mirrored).apply(parameters, LATTICE))[0]
+    return replace(problem, unknowns=replace(unknowns, given=given, sigma=sigma, start=start))
 
 
 # Of the six terms of degree 2 two are decentering, and the tilts of the images take two.
@@ -368,7 +327,8 @@ def _jumps(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
 
         fields_mm = jump.beyond[:, None, None] * np.eye(2)
         found = _displaced_images(run, f"jump {jump.image}", "jump", camera, words, fields_mm)
-        yield replace(found, selection=Selection(choices=jump.choices, contrasts=2 * len(rows)))
+        # The best of as many jumps as there are coordinates.
+        yield replace(found, selection=Selection(choices=float(np.log(2.0 * len(rows))), contrasts=2 * len(rows)))
 
 
 def film_deformations(run: Run) -> Iterator[ModelHypothesis]:
@@ -433,8 +393,22 @@ def _apart(run: Run, camera: Camera, others: Mapping[str, str], count: int) -> t
     network, names = run.problem.network, dict.fromkeys(others.values(), camera.name)
     images = tuple(replace(each, camera=others.get(each.frame, each.camera)) for each in network.images)
     cameras = (*network.cameras, *(replace(camera, name=name) for name in names))
-    problem = continued(run, replace(network, images=images, cameras=cameras), names, count)
-    return problem, np.concatenate([problem.unknowns.camera[name][:count] for name in names])
+    problem = continued(run, replace(network, images=images, cameras=cameras), names)
+    unknowns = problem.unknowns
+    given, sigma, start = unknowns.given.copy(), unknowns.sigma.copy(), unknowns.start.copy()
+    of_camera, fiducial, own = dict(unknowns.camera), dict(unknowns.fiducial), unknowns.camera[camera.name]
+    for name in names:
+        free = of_camera[name][:count]
+        given[free], sigma[free], start[free] = np.nan, np.inf, start[own[:count]]
+        # All else, and the fiducial marks, are those of the camera.
+        sigma[of_camera[name][count:]] = 0.0
+        of_camera[name] = np.concatenate([free, own[count:]])
+        for (owner, id_), pair in unknowns.fiducial.items():
+            if owner == name:
+                sigma[pair] = 0.0
+                fiducial[name, id_] = fiducial[camera.name, id_]
+    shared = replace(unknowns, given=given, sigma=sigma, start=start, camera=of_camera, fiducial=fiducial)
+    return replace(problem, unknowns=shared), np.concatenate([of_camera[name][:count] for name in names])
 
 
 def _distance_words(camera: str, images: Sequence[str], found: Estimate) -> tuple[str, str]:
@@ -694,7 +668,11 @@ def _point_words(selection: Selection, fixed: Mask, given: Array) -> Words:
             offs, sigmas = -found.value[None], found.sigma[None]
         else:
             offs[fixed], sigmas[fixed] = given - found.value, found.sigma
-        by = [_shift_words(*each) for each in zip(offs, sigmas, strict=True)]
+        by = list[str]()
+        for off, sigma in zip(offs, sigmas, strict=True):
+            digits = [max(0, -int(np.floor(np.log10(max(s, 1e-12))))) for s in sigma]
+            rows = zip("XYZ", off, sigma, digits, strict=True)
+            by.append(", ".join(f"{axis} by {d:+.{n}f} ± {s:.1g}" for axis, d, s, n in rows if s > 0.0))
         some = shortened(names, MOST_NAMED)
         if selection.words:
             return (
@@ -715,9 +693,3 @@ def _point_words(selection: Selection, fixed: Mask, given: Array) -> Words:
         )
 
     return words
-
-
-def _shift_words(off: Array, sigma: Array) -> str:
-    digits = [max(0, -int(np.floor(np.log10(max(s, 1e-12))))) for s in sigma]
-    rows = zip("XYZ", off, sigma, digits, strict=True)
-    return ", ".join(f"{axis} by {d:+.{n}f} ± {s:.1g}" for axis, d, s, n in rows if s > 0.0)

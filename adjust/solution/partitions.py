@@ -61,7 +61,11 @@ def own_distances(run: Run, equations: InteriorEquations) -> Selection | None:
     """Select all frames of a camera but the first for a principal distance of their own; None where they need none."""
     names, normal, right = equations
     count = len(names) - 1
-    of_distances, of_all = (_heterogeneity(normal[:, :k, :k], right[:, :k]) for k in (1, len(INTERIOR_NAMES)))
+    # Decrease of v'Pv by changes of each image's own in place of common ones: Cochran's Q.
+    of_distances, of_all = (
+        float(quadratic(n, g).sum() - quadratic(n.sum(axis=0), g.sum(axis=0)))
+        for n, g in ((normal[:, :1, :1], right[:, :1]), (normal, right))
+    )
     vpv, redundancy = run.group_sums(run.weighting.used)
     variance = max(1.0, vpv / redundancy)
     if count < 1 or chdtrc(count, of_distances / variance) > LEVEL:
@@ -70,11 +74,6 @@ def own_distances(run: Run, equations: InteriorEquations) -> Selection | None:
     of_points = max((of_all - of_distances) / (2.0 * count), variance)
     p = float(fdtrc(count, 2.0 * count, of_distances / count / of_points))
     return Selection(names[1:], p_scatter=lambda: p)
-
-
-def _heterogeneity(normal: Array, right: Array) -> float:
-    """Decrease of v'Pv by changes of each image's own in place of common ones (Cochran's Q)."""
-    return float(quadratic(normal, right).sum() - quadratic(normal.sum(axis=0), right.sum(axis=0)))
 
 
 def two_groups(run: Run, camera: str, equations: InteriorEquations) -> Selection | None:
@@ -166,48 +165,39 @@ def _clearness(changes: Array, weight: Array) -> Array:
 
 
 class Jump(NamedTuple):
-    """Marks beyond a row (axis 1) or column (0) of one image, or of all ("").
-
-    beyond: mask of the observations; cut_mm: in the comparator; choices: natural logarithm of the number of jumps that
-    it is the best of.
-    """
+    """Mask of the marks beyond a row (axis 1) or column (0), in the comparator, of one image, or of all ("")."""
 
     image: str
     axis: int
     cut_mm: float
     beyond: Mask
-    choices: float
 
 
 def jumps(run: Run, rows: Indices) -> Iterator[Jump]:
     """Select the row or column beyond which the targets (n,) of one image, and of all, are displaced most clearly."""
     problem, places = run.problem, run.end.computed_mm
+    transform, residual = run.misfits.transform[rows], run.misfits.residual[rows, :, None]
+    own_normal, own_right = transform.swapaxes(1, 2) @ transform, (transform.swapaxes(1, 2) @ residual)[..., 0]
     images, own = np.unique(problem.image_numbers[rows], return_inverse=True)
     for of_image in (own, np.zeros_like(own)):
         found = []
         for axis in range(2):
             along = places[rows, axis]
             cuts = np.quantile(along, np.linspace(0.0, 1.0, BINS + 1)[1:-1])
-            falls = _jump_falls(run, rows, of_image, along, cuts)
+            # (m, c) decreases of v'Pv by displacements of each image's marks beyond each cut, all other unknowns held.
+            count, part = int(of_image.max()) + 1, of_image * BINS + np.searchsorted(cuts, along)
+            normal, right = np.zeros((count * BINS, 2, 2)), np.zeros((count * BINS, 2))
+            np.add.at(normal, part, own_normal)
+            np.add.at(right, part, own_right)
+            parts = normal.reshape(count, BINS, 2, 2), right.reshape(count, BINS, 2)
+            falls = quadratic(*(np.cumsum(each[:, :0:-1], axis=1)[:, ::-1] for each in parts))
             image, at = (int(k) for k in np.unravel_index(np.argmax(falls), falls.shape))
             found.append((float(falls[image, at]), float(cuts[at]), axis, image))
         _, cut_mm, axis, image = max(found)
         beyond = np.zeros(len(places), dtype=bool)
         beyond[rows] = (of_image == image) & (places[rows, axis] > cut_mm)
         name = problem.network.images[images[image]].name if of_image is own else ""
-        yield Jump(name, axis, cut_mm, beyond, float(np.log(2.0 * len(rows))))
-
-
-def _jump_falls(run: Run, rows: Indices, of_image: Indices, along: Array, cuts: Array) -> Array:
-    """(m, c) decreases of v'Pv by displacements of each image's marks beyond each cut, all other unknowns held."""
-    transform, residual = run.misfits.transform[rows], run.misfits.residual[rows, :, None]
-    count, bins = int(of_image.max()) + 1, len(cuts) + 1
-    part = of_image * bins + np.searchsorted(cuts, along)
-    normal, right = np.zeros((count * bins, 2, 2)), np.zeros((count * bins, 2))
-    np.add.at(normal, part, transform.swapaxes(1, 2) @ transform)
-    np.add.at(right, part, (transform.swapaxes(1, 2) @ residual)[..., 0])
-    parts = normal.reshape(count, bins, 2, 2), right.reshape(count, bins, 2)
-    return quadratic(*(np.cumsum(each[:, :0:-1], axis=1)[:, ::-1] for each in parts))
+        yield Jump(name, axis, cut_mm, beyond)
 
 
 def displaced_points(
@@ -218,15 +208,20 @@ def displaced_points(
     axes (m, 3): of the field, along which points form lines; fixed: (3,) by point, its fixed coordinates; problem: the
     one in which these are free; most: single points at most.
     """
-    names = tuple(fixed)
-    system = _point_equations(run, problem, fixed) if FEWEST <= len(names) <= MOST else None
-    if system is None:
+    names, count = tuple(fixed), len(fixed)
+    at = run.linearised(problem) if FEWEST <= count <= MOST else None
+    if at is None:
         return
-    normal, right = system
+    # N (p, 3, p, 3) and g (p, 3), the unknowns of the run eliminated; 0 for coordinates that are not fixed.
+    positions = np.concatenate([problem.unknowns.point[name] for name in names])
+    is_fixed = diags_array(np.concatenate([*fixed.values()]) * 1.0)
+    by_points = derivatives_by(problem, at.rows.matrix, positions) @ is_fixed
+    across = (run.unit_functions[: by_points.shape[0]].T @ by_points).toarray()
+    normal = (by_points.T @ by_points).toarray() - across.T @ run.factor.cofactor_times(across)
+    normal, right = normal.reshape(count, 3, count, 3), (by_points.T @ at.rows.right.ravel()).reshape(count, 3)
     vpv, redundancy = run.group_sums(run.weighting.used)
     single = _single_points(normal, right, vpv, redundancy)[:most]
     if len(single):
-        count = len(names)
         choices = gammaln(count + 1) - gammaln(len(single) + 1) - gammaln(count - len(single) + 1)
         yield Selection(tuple(names[k] for k in single), "", float(choices), 3 * (count - 1))
     places = run.problem.network.known_places
@@ -236,19 +231,6 @@ def displaced_points(
         of_groups = np.einsum("li,iajb,lj->lab", members, normal, members, optimize=True)
         words, mask = groups[int(np.argmax(quadratic(of_groups, members @ right)))]
         yield Selection(_some(names, mask), words, float(np.log(len(groups))))
-
-
-def _point_equations(run: Run, problem: Problem, fixed: Mapping[str, Mask]) -> tuple[Array, Array] | None:
-    """N (p, 3, p, 3) and g (p, 3) of points, the unknowns of the run eliminated; 0 for coordinates not fixed."""
-    if (at := run.linearised(problem)) is None:
-        return None
-    positions, count = np.concatenate([problem.unknowns.point[name] for name in fixed]), len(fixed)
-    by_points = derivatives_by(problem, at.rows.matrix, positions) @ diags_array(
-        np.concatenate([*fixed.values()]) * 1.0
-    )
-    across = (run.unit_functions[: by_points.shape[0]].T @ by_points).toarray()
-    normal = (by_points.T @ by_points).toarray() - across.T @ run.factor.cofactor_times(across)
-    return normal.reshape(count, 3, count, 3), (by_points.T @ at.rows.right.ravel()).reshape(count, 3)
 
 
 def _single_points(normal: Array, right: Array, vpv: float, redundancy: float) -> list[int]:

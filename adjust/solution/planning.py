@@ -70,7 +70,17 @@ def plan(network: Network, values: Approximations, options: Options | None = Non
     options = options or Options()
     validate_plan(network)
     numbered, reduction = number_reduced(network, values)
-    problem = _computed_problem(numbered)
+    unknowns, xy_mm = numbered.unknowns, computed_observations(numbered, numbered.start())
+    if xy_mm is None:
+        reason, _ = next(iter(blind_marks(numbered, numbered.start()).values()))
+        raise AdjustmentError(
+            f"The network cannot be planned: {reason}. Turn the camera towards the field, or leave the point out of "
+            "that image."
+        )
+    computed = error_free(numbered.network, unknowns, unknowns.start)
+    computed = replace(computed, observations=replace(computed.observations, xy_mm=xy_mm))
+    given = np.where(np.isnan(unknowns.given), np.nan, unknowns.start)
+    problem = replace(numbered, network=computed, unknowns=replace(unknowns, given=given))
     result = adjust_problem(problem, options)
     singular = result.singular
     null = np.zeros((len(problem.unknowns), 0))
@@ -82,21 +92,6 @@ def plan(network: Network, values: Approximations, options: Options | None = Non
     variance = replace(result.variance, sigma0=sigma0)
     expected = replace(result, network=own, values=adjusted, vpv=sigma0**2 * result.redundancy, variance=variance)
     return Plan(expected, sigma0, singular, null)
-
-
-def _computed_problem(problem: Problem) -> Problem:
-    xy_mm = computed_observations(problem, problem.start())
-    if xy_mm is None:
-        reason, _ = next(iter(blind_marks(problem, problem.start()).values()))
-        raise AdjustmentError(
-            f"The network cannot be planned: {reason}. Turn the camera towards the field, or leave the point out of "
-            "that image."
-        )
-    unknowns = problem.unknowns
-    network = error_free(problem.network, unknowns, unknowns.start)
-    network = replace(network, observations=replace(network.observations, xy_mm=xy_mm))
-    given = np.where(np.isnan(unknowns.given), np.nan, unknowns.start)
-    return replace(problem, network=network, unknowns=replace(unknowns, given=given))
 
 
 def _regularised(problem: Problem) -> tuple[list[int], Array]:

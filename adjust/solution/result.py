@@ -9,18 +9,18 @@ from typing import Any, Literal
 import numpy as np
 
 from adjust.array_types import Array, Indices, Mask
-from adjust.display import (
-    CameraPlots,
-    PlottedResult,
-    adjusted_camera_plots,
-    data_frame,
-    parameter_columns,
-    residual_columns,
-)
+from adjust.display import CameraPlots, PlottedResult, data_frame
 from adjust.least_squares.equations import Numbering
 from adjust.least_squares.iteration import Iteration
 from adjust.problem.camera import Camera
-from adjust.problem.estimates import Cofactor, Estimates, NullDirection, VarianceFactor
+from adjust.problem.estimates import (
+    Cofactor,
+    Estimates,
+    NullDirection,
+    VarianceFactor,
+    adjusted_lens,
+    observed_places,
+)
 from adjust.problem.network import STRAIGHT, Approximations
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem
@@ -134,12 +134,12 @@ class Adjustment(Estimates, PlottedResult):
     @cached_property
     def variance_sigmas(self) -> Mapping[str, float]:
         """Standard deviations of the variance factors."""
-        return factor_sigmas(self.run) if self._is_tested and self.run.weighting.factors else {}
+        return factor_sigmas(self.run) if self.run.has_solution and self.run.weighting.factors else {}
 
     @cached_property
     def reliability(self) -> Reliability | None:
         """Baarda's internal and external reliability; None without a solution."""
-        return reliability(self.run, self.variance, self.probabilities) if self._is_tested else None
+        return reliability(self.run, self.variance, self.probabilities) if self.run.has_solution else None
 
     @cached_property
     def correlations(self) -> tuple[Correlation, ...]:
@@ -220,19 +220,41 @@ class Adjustment(Estimates, PlottedResult):
             found = self.projection_uncertainty(shown.name, distance)
             return found.places_mm, found.sigma_mm
 
-        covariance_of = self.larger_covariance_of
-        return adjusted_camera_plots(self, covariance_of, shown, self.residuals.v_mm, uncertainty, pixel_mm)
+        observations, v_mm = self.network.observations, self.residuals.v_mm
+        rows, observed = observed_places(self, shown.name, observations.xy_mm)
+        _, adjusted = observed_places(self, shown.name, observations.xy_mm + v_mm)
+        lens = adjusted_lens(self, shown.name)
+        keys = [Parameter.interior(shown.name, each) for each in lens.quantities]
+        return CameraPlots(
+            name=shown.name,
+            lens=replace(lens, covariance=self.larger_covariance_of(keys)),
+            places_mm=observed,
+            vectors_mm=adjusted - observed,
+            is_fiducial=observations.is_fiducial[rows],
+            images=sum(image.camera == shown.name for image in self.network.images),
+            corners_mm=np.array(shown.frame_corners(observed) or (observed.min(axis=0), observed.max(axis=0))),
+            uncertainty=uncertainty,
+            pixel_mm=pixel_mm,
+        )
 
     def to_pandas(self, table: Literal["parameters", "residuals"] = "parameters") -> Any:
         """Return a table as pandas.DataFrame: one row per quantity or per observation; pandas has to be installed."""
-        if table == "residuals":
-            return data_frame(residual_columns(self.network.observations, self.residuals))
-        return data_frame(parameter_columns(self))
+        if table != "residuals":
+            columns: dict[str, Any] = {
+                name: [getattr(each, name) for each in self.parameters] for name in ("kind", "owner", "id", "quantity")
+            }
+            return data_frame(columns | {"value": self.values, "sigma": self.sigma0 * np.sqrt(self.cofactor.variances)})
+        observations, v = self.network.observations, self.residuals
+        columns = {name: getattr(observations, name) for name in ("image", "point", "kind")}
+        pairs = {"{}_mm": observations.xy_mm, "v{}_um": 1e3 * v.v_mm, "redundancy_{}": v.redundancy, "w_{}": v.w}
+        return data_frame(
+            columns | {name.format(axis): pair[:, k] for name, pair in pairs.items() for k, axis in enumerate("xy")}
+        )
 
     @cached_property
     def suspects(self) -> tuple[Suspect, ...]:
         """Suspected gross errors, worst first, after accounting for the explanations of all residuals."""
-        if self.misread or not self._is_tested:
+        if self.misread or not self.run.has_solution:
             return ()
         run, variance, tested = self._explanation_run[1], self.variance, self.reliability
         if run is not self.run:
@@ -278,20 +300,13 @@ class Adjustment(Estimates, PlottedResult):
 
     @cached_property
     def _explanation_run(self) -> tuple[tuple[Explanation, ...], Run]:
-        return explain(self.run, _redundancy(self.run, self.cofactor), self.probabilities, self._unmodelled_share)
-
-    @property
-    def _unmodelled_share(self) -> float:
-        """Mean share of the estimated standard deviation of unmodelled errors in the variance of targets."""
+        # Mean share of the estimated standard deviation of unmodelled errors in the variance of targets.
         observations, images = self.network.observations, self.network.images
         added = np.array([self.unmodelled_mm.get(image.camera, 0.0) for image in images])[self.network.image_numbers]
         variance = np.trace(observations.covariance_mm2, axis1=1, axis2=2) / 2.0
-        targets = ~observations.is_fiducial
-        return float(np.mean((added**2 / variance)[targets])) if targets.any() else 0.0
-
-    @property
-    def _is_tested(self) -> bool:
-        return self.run.has_solution and self.run.is_tested
+        shares = (added**2 / variance)[~observations.is_fiducial]
+        unmodelled = float(np.mean(shares)) if len(shares) else 0.0
+        return explain(self.run, _redundancy(self.run, self.cofactor), self.probabilities, unmodelled)
 
     def __repr__(self) -> str:
         return (
@@ -335,7 +350,7 @@ def _result(given: Problem, last: Run, members: Indices | None, probabilities: P
     variance = variance_factor(last, redundancy)
     scaled = _scaled_run(last, variance)
     return Adjustment(
-        network=problem.network,
+        network=given.network,
         termination=last.solution.termination,
         iterations=len(last.solution.history),
         conditions=redundancy + len(last.numbering.free),
@@ -408,8 +423,7 @@ def adjust_problem(
     solution = run(replace(solved, unknowns=solved.unknowns.fixed(held)), options, doubted, mismatched or {})
     if options.datum == "free":
         solution = _center_datum(problem, solution, members, options)
-    result = _result(problem, solution, members if options.datum == "free" else None, options.probabilities)
-    return replace(result, network=problem.network)
+    return _result(problem, solution, members if options.datum == "free" else None, options.probabilities)
 
 
 def settle_datum(problem: Problem, options: Options) -> Problem:

@@ -142,9 +142,15 @@ def _run(problem: Problem, weighting: Weighting, state: State, limit: int) -> Ru
 
 def _release_cameras(problem: Problem, weighting: Weighting, begun: Run, limit: int) -> Run:
     """Release all parameters, starting from the end of a run that held some."""
-    # Where the observations do not separate distortion parameters, these get pseudo-observations, as weak as possible.
-    state, start = begun.end.state, _apart(problem, begun.end.state)
-    at = begun.linearised(problem, state)
+    # It starts apart from it, at nearly the same images, in which the derivatives of the free distortion parameters
+    # differ. Where the observations do not separate these, they get pseudo-observations, as weak as possible.
+    state, unknowns = begun.end.state, problem.unknowns
+    values = state.values.copy()
+    for camera in (name for name, alike in _alike_at_zero(problem, state).items() if alike):
+        own = unknowns.camera[camera][3:]
+        apart = family(problem.network.camera_by_name[camera].distortion.family).apart(values[own])
+        values[own] = np.where(np.isinf(unknowns.sigma[own]), apart, values[own])
+    start, at = State(values, state.rotations), begun.linearised(problem, state)
     motions = edge_motions(problem, at) if at is not None else {}
     for reach in REACHES if motions else ():
         held = replace(problem, pseudo_observed={i: reach * motion for i, motion in motions.items()})
@@ -169,16 +175,6 @@ def _alike_at_zero(problem: Problem, state: State, with_others: bool = False) ->
         free = [at for at in alike if np.isinf(unknowns.sigma[at])]
         found[camera] = [at for at in free if with_others or state.values[at] == 0.0]
     return found
-
-
-def _apart(problem: Problem, state: State) -> State:
-    """Return a state of nearly the same images in which the derivatives of the free distortion parameters differ."""
-    values, unknowns = state.values.copy(), problem.unknowns
-    for camera in (name for name, alike in _alike_at_zero(problem, state).items() if alike):
-        at = unknowns.camera[camera][3:]
-        apart = family(problem.network.camera_by_name[camera].distortion.family).apart(values[at])
-        values[at] = np.where(np.isinf(unknowns.sigma[at]), apart, values[at])
-    return State(values, state.rotations)
 
 
 def _iterate(problem: Problem, weighting: Weighting, state: State, limit: int) -> Run:

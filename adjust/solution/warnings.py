@@ -64,9 +64,12 @@ def run_warnings(run: Run, cofactor: Cofactor, residuals: Residuals) -> list[str
 def _termination(run: Run) -> Iterator[str]:
     termination = run.solution.termination
     if termination == "iteration limit":
+        # Along a flat valley an iteration does not end either: there small residuals would only mislead.
+        is_gross = _is_gross(run.numbering.problem.network.observations, run.end.v_mm).any()
+        largest = f" The largest residuals are those of {_largest_residuals(run)}." if is_gross else ""
         yield (
             f"The iteration did not stand still within {len(run.solution.history)} steps: the values are not final."
-            + (f" The largest residuals are those of {_largest_residuals(run)}." if _some_gross(run) else "")
+            f"{largest}"
         )
     if termination == "diverged":
         yield (
@@ -79,11 +82,6 @@ def _termination(run: Run) -> Iterator[str]:
             f"The weights did not settle within {ROUNDS} rounds of robust estimation, variance components or data "
             f"snooping."
         )
-
-
-def _some_gross(run: Run) -> bool:
-    # Along a flat valley an iteration does not end either: there small residuals would only mislead.
-    return bool(_is_gross(run.numbering.problem.network.observations, run.end.v_mm).any())
 
 
 def _largest_residuals(run: Run) -> str:
@@ -182,7 +180,7 @@ def _repeated_images(run: Run) -> Iterator[str]:
     point = np.array(observations.point)
     images = [(name, rows[np.argsort(point[rows], kind="stable")]) for name, rows in _rows_by_image(problem)]
     marks = run.weighting.used & (np.arange(len(run.units)) < len(observations))
-    vpv, redundancy = run.group_sums(marks) if run.converged and run.is_tested else (1.0, 1.0)
+    vpv, redundancy = run.group_sums(marks) if run.converged else (1.0, 1.0)
     covariance = observations.covariance_mm2 * (vpv / redundancy if redundancy >= 1.0 else 1.0)
     middles = np.array([observations.xy_mm[rows].mean(axis=0) for _, rows in images])
     reach = 2.0 * float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).max(initial=0.0)))
