@@ -64,10 +64,11 @@ class SightVectors:
 def sight_vectors(setting: LineOfSight, station: Array, xyz: Array) -> SightVectors:
     """Compute the vectors from stations (3,) or (n, 3) to the apparent places of points (n, 3)."""
     stations, unit_m = np.broadcast_to(station, xyz.shape), setting.unit_m
-    straight = SightVectors(
-        xyz - stations, *(np.broadcast_to(side * np.eye(3), (*xyz.shape, 3)) for side in (-1.0, 1.0))
-    )
-    apparent = _over_the_sphere(unit_m, stations, xyz) if setting.curvature else straight
+    if setting.curvature:
+        apparent = _over_the_sphere(unit_m, stations, xyz)
+    else:
+        shape = (*xyz.shape, 3)
+        apparent = SightVectors(xyz - stations, np.broadcast_to(-np.eye(3), shape), np.broadcast_to(np.eye(3), shape))
     if not setting.refraction:
         return apparent
     # Raise the points by the refraction coefficient times the square of their distance.

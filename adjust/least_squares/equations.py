@@ -174,7 +174,7 @@ class Numbering:
         of_point = np.full(len(unknowns) + 1, len(points), dtype=np.intp)  # the last stands for ABSENT
         of_point[points[:, 0]] = np.arange(len(points))
         block = of_point[np.where(problem.is_fiducial, ABSENT, problem.places[:, 0])]
-        nothing = np.full((len(of_frames), 3), ABSENT, dtype=np.intp)  # owned by the frames' other observations
+        nothing = np.full((len(of_frames), 3), ABSENT, dtype=np.intp)  # the frames' other observations own nothing
         block = block + np.where(block == len(points), self._frame_of_rows, 0)
         return _Blocks(np.concatenate([points, nothing]), block, are_points=True)
 

@@ -107,8 +107,6 @@ def band_order(meeting: csr_array) -> Indices:
 
     meeting (g, g): adjacency matrix, with an entry for any two groups that occur in the same block of observations.
     """
-    if meeting.shape[0] == 0:
-        return np.empty(0, dtype=np.intp)
     return np.asarray(reverse_cuthill_mckee(meeting, symmetric_mode=True), dtype=np.intp)
 
 

@@ -309,11 +309,9 @@ def blind_marks(problem: Problem, state: State) -> dict[str, tuple[str, str]]:
             if number < len(behind):
                 why = "lies behind the camera"
                 check = "the sign of W: M rotates from object to camera, which looks along its negative z axis"
-            placed = (
-                "the number and the coordinates of the point"
-                if images[row].exterior is None
-                else "the given orientation"
-            )
+            placed = "the given orientation"
+            if images[row].exterior is None:
+                placed = "the number and the coordinates of the point"
             reason = f"point {observations.point[row]} {why} in image {images[row].name}"
             blind.setdefault(images[row].name, (reason, f"Check {placed}, and {check}."))
     camera_xy = None if blind else _computed_in_camera(problem, state, targets)
