@@ -86,11 +86,6 @@ class FrameMisfit:
     jump_mm: float | None = None
     weak_mm2: float = 0.0
 
-    @classmethod
-    def from_marks(cls, marks: FrameMarks, sites: NDArray[np.intp], pose: str, weak: Mask) -> "FrameMisfit":
-        """Start with no explanation."""
-        return cls(marks, sites, pose, weak, np.zeros(len(sites)), np.zeros(len(sites)))
-
     @property
     def places(self) -> NDArray[np.intp]:
         """(2n,) indices of its marks' coordinates in the pattern."""
@@ -135,7 +130,8 @@ class Pattern:
         covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
         if is_pooled:
             covariance = self._beyond_affine @ covariance @ self._beyond_affine
-        return frame.enlarged_marks.expecting((covariance @ right)[frame.places].reshape(-1, 2), covariance[own])
+        expected, marks = (covariance @ right)[frame.places].reshape(-1, 2), frame.enlarged_marks
+        return replace(marks, off_mm=marks.off_mm - expected, shared_mm2=covariance[own])
 
     @cached_property
     def mm(self) -> Array:
@@ -200,11 +196,6 @@ class Explanation:
         """Whether no other frame checks the misfit of any: at most one has more marks than an affine transformation
         needs."""
         return sum(each.marks.redundancy > 0 for each in self.frames.values()) < 2
-
-    @property
-    def is_quiet(self) -> bool:
-        """Whether there is no outlier."""
-        return not (self.film_is_more or any(each.film_mm or each.off_mm.any() for each in self.frames.values()))
 
     @property
     def log_evidence(self) -> float:
@@ -401,7 +392,15 @@ def check_frames(
     misfits = {place: each for place, each in found.items() if each is not None}
     if misfits:
         shared, problem = _explain_together(misfits, layout, film.sigma_mm)
-        common = [each for each in (problem, _scattering_film(shared, film)) if each]
+        common = [problem] if problem else []
+        if shared.film_is_more:  # next to frames that scatter so much a wrong mark hides
+            sentence = (
+                "in the frames of its camera film or scanner displaces the marks by "
+                f"{1000 * shared.film.sigma:.0f} µm along an axis, where {1000 * film.sigma_mm:.0f} µm are expected: a "
+                "mark that is wrong by several times as much is not seen. Their standard deviations are set to it. If "
+                "it is right, state film_sigma_um under [adjust]."
+            )
+            common.append(Reason(sentence, Code.BENT_FRAME))
         for place, own in shared.frames.items():
             names = [layout.marks[index].id for index in misfits[place].sites]
             checked[place], films[place] = _add_findings(checked[place], place, shared, names, film)
@@ -426,7 +425,8 @@ def _misfit(
     covariances = np.array([mm @ np.asarray(mark.covariance_px2) @ mm.T for mark in marks])
     pose = frame.pose.name if frame.pose else "0"
     weak = np.array([mark.status is Status.WEAK for mark in marks])
-    return FrameMisfit.from_marks(FrameMarks.from_places(given, measured, covariances, film.model), sites, pose, weak)
+    own = FrameMarks.from_places(given, measured, covariances, film.model)
+    return FrameMisfit(own, sites, pose, weak, off_mm=np.zeros(len(marks)), suspect_mm2=np.zeros(len(marks)))
 
 
 def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) -> tuple[Explanation, Reason]:
@@ -437,40 +437,52 @@ def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) ->
     if by_given.is_lone:
         return by_given, NO_REASON
     by_places = explain_by_pattern(frames, given, film_mm)
-    is_clear, rest = (
-        by_places.pattern.p_value >= FALSE_DOUBT,
-        " The scanner may do the same: all frames lie alike in it.",
+    is_clear = by_places.pattern.p_value >= FALSE_DOUBT
+    rest = " The scanner may do the same: all frames lie alike in it."
+    has_outliers = by_places.film_is_more or any(
+        each.film_mm or each.off_mm.any() for each in by_places.frames.values()
     )
-    lie_alike = len({each.pose for each in frames.values()}) == 1
-    if not lie_alike and not (is_clear and by_places.is_quiet):
-        sites = _scan_sites(frames)
-        turned = {place: _in_scan_axes(each, sites, given_mm) for place, each in frames.items()}
+    if len({each.pose for each in frames.values()}) > 1 and (has_outliers or not is_clear):
+        sites, turned = _in_scan_axes(frames, given_mm)
         by_scanner = explain_by_pattern(turned, Pattern(sites, np.zeros(len(sites))), film_mm)
         lead = by_scanner.log_evidence - by_places.log_evidence
         if lead > NAMED and by_scanner.pattern.p_value < FALSE_DOUBT:
-            return by_scanner, _bent_scans(by_scanner)
+            most = float(np.hypot(*by_scanner.pattern.mm.T).max())
+            return by_scanner, Reason(
+                f"all scans are bent in the same way in the scanner's axes, by up to {most:.3f} mm after an affine "
+                f"transformation (p = {by_scanner.pattern.p_value:.1g} without): the scanner does it.",
+                Code.BENT_SCANS,
+            )
         rest = "" if lead < -NAMED else " The scanner may do the same."
     if is_clear:
         return by_given, NO_REASON
-    return by_places, _wrong_places(by_places, layout, rest)
+    off_mm = np.hypot(*by_places.pattern.mm.T)
+    worst = np.argsort(-off_mm, kind="stable")[:_NAMED_MARKS]
+    off = ", ".join(f"{layout.marks[k].id} by {off_mm[k]:.3f} mm" for k in worst)
+    off += f", {len(off_mm) - len(worst)} others by less" if len(off_mm) > len(worst) else ""
+    return by_places, Reason(
+        f"the given coordinates differ from all frames of the camera in the same way, {off}, after an affine "
+        f"transformation: p = {by_places.pattern.p_value:.1g} for their standard deviations. Check whether they are "
+        f"those of this camera.{rest}",
+        Code.OFF_GIVEN,
+    )
 
 
-def _scan_sites(frames: Frames) -> Array:
-    """(m, 2) sites of the marks of all frames, in the scan's axes."""
+def _in_scan_axes(frames: Frames, given_mm: Array) -> tuple[Array, dict[int, FrameMisfit]]:
+    """(m, 2) sites of the marks of all frames in the scan's axes; and the frames in these axes, each mark at the
+    nearest site, with the variances of its given place added."""
     places = [each.marks.given_mm @ UP_FROM_CAMERA[each.pose].T for each in frames.values()]
     near = _SAME_SITE * min(float(pdist(own).min()) for own in places)
-    sites = list[Array]()
+    distinct = list[Array]()
     for place in np.unique(np.round(np.concatenate(places), 6), axis=0):
-        if not any(np.hypot(*(place - site)) < near for site in sites):
-            sites.append(place)
-    return np.array(sites)
-
-
-def _in_scan_axes(frame: FrameMisfit, sites: Array, given_mm: Array) -> FrameMisfit:
-    """Transform a frame to the scan's axes and nearest sites (m, 2), with the variances of its given places added."""
-    marks = frame.marks.widen(given_mm[frame.sites] ** 2).rotate(UP_FROM_CAMERA[frame.pose])
-    nearest = np.hypot(*np.moveaxis(marks.given_mm[:, None] - sites[None], -1, 0)).argmin(axis=1)
-    return replace(frame, marks=marks, sites=nearest)
+        if not any(np.hypot(*(place - site)) < near for site in distinct):
+            distinct.append(place)
+    sites, turned = np.array(distinct), {}
+    for place, frame in frames.items():
+        marks = frame.marks.widen(given_mm[frame.sites] ** 2).rotate(UP_FROM_CAMERA[frame.pose])
+        nearest = np.hypot(*np.moveaxis(marks.given_mm[:, None] - sites[None], -1, 0)).argmin(axis=1)
+        turned[place] = replace(frame, marks=marks, sites=nearest)
+    return sites, turned
 
 
 def _add_findings(
@@ -485,7 +497,8 @@ def _add_findings(
     if shared.is_lone:
         code, cause = Code.OFF_GIVEN, Cause.GIVEN_PLACES
         has_it = "the other marks have it, more than film and given places explain"
-    added = film_mm**2 - film.added_later_mm**2 if film_mm > film.sigma_mm else 0.0
+    added_later_mm = film.sigma_mm if film.is_stated else 0.0
+    added = film_mm**2 - added_later_mm**2 if film_mm > film.sigma_mm else 0.0
     variances = np.maximum(added, own.suspect_mm2)
     changed = {mark.point: mark for mark in _observed_fiducials(frame)}
     for name, off, variance, is_weak in zip(names, own.off_mm.tolist(), variances.tolist(), own.weak, strict=True):
@@ -550,45 +563,6 @@ def _problem(place: int, shared: Explanation, names: Sequence[str], known_um: fl
     )
 
 
-def _wrong_places(shared: Explanation, layout: FiducialLayout, rest: str) -> Reason:
-    off = _distances([mark.id for mark in layout.marks], np.hypot(*shared.pattern.mm.T))
-    return Reason(
-        f"the given coordinates differ from all frames of the camera in the same way, {off}, after an affine "
-        f"transformation: p = {shared.pattern.p_value:.1g} for their standard deviations. Check whether they are those "
-        f"of this camera.{rest}",
-        Code.OFF_GIVEN,
-    )
-
-
-def _bent_scans(shared: Explanation) -> Reason:
-    most = float(np.hypot(*shared.pattern.mm.T).max())
-    return Reason(
-        f"all scans are bent in the same way in the scanner's axes, by up to {most:.3f} mm after an affine "
-        f"transformation (p = {shared.pattern.p_value:.1g} without): the scanner does it.",
-        Code.BENT_SCANS,
-    )
-
-
-def _scattering_film(shared: Explanation, film: BelievedFilm) -> Reason:
-    """Problem of all frames where film scatters more than it should: next to such frames a wrong mark hides."""
-    if not shared.film_is_more:
-        return NO_REASON
-    return Reason(
-        "in the frames of its camera film or scanner displaces the marks by "
-        f"{1000 * shared.film.sigma:.0f} µm along an axis, where {1000 * film.sigma_mm:.0f} µm are expected: a mark "
-        "that is wrong by several times as much is not seen. Their standard deviations are set to it. If it is right, "
-        "state film_sigma_um under [adjust].",
-        Code.BENT_FRAME,
-    )
-
-
-def _distances(names: Sequence[str], off_mm: Array) -> str:
-    """List the marks with the largest deviations."""
-    worst = np.argsort(-off_mm, kind="stable")[:_NAMED_MARKS]
-    rest = f", {len(names) - len(worst)} others by less" if len(names) > len(worst) else ""
-    return ", ".join(f"{names[k]} by {off_mm[k]:.3f} mm" for k in worst) + rest
-
-
 # The place from a mark's edges differs from the matched one if the mark is damaged or not as drawn. Larger differences
 # in many of a camera's marks than their covariances explain mean that the drawings or the noise model are not exact: a
 # variance factor is estimated from their median, with a prior of 1. An outlier even with this factor is damaged. Any
@@ -600,31 +574,24 @@ def check_second_places(frames: Sequence[FrameMeasurement]) -> list[FrameMeasure
     matched places."""
     tested = [(n, m) for n, each in enumerate(frames) for m in _observed_fiducials(each) if _SIGMAS in m.quality]
     squares = np.array([mark.quality[_SIGMAS] ** 2 for _, mark in tested])
-    changed: list[dict[str, MarkMeasurement]] = [{} for _ in frames]
-    is_odd = chdtrc(_AXES, squares) * len(squares) < FALSE_DOUBT
-    is_alone = _p_values_among_others(squares) * len(squares) < FALSE_DOUBT
-    for index in np.flatnonzero(is_odd).tolist():
-        number, mark = tested[index]
-        changed[number][mark.point] = _doubt_edges(mark, bool(is_alone[index]))
-    return [_replace_marks(*each) for each in zip(frames, changed, strict=True)]
-
-
-def _p_values_among_others(squares: Array) -> Array:
-    """(n,) p-values of squared normalised differences, with the variance factor of the other marks."""
+    # With the variance factor of the other marks. Below 1 it is not applied: small differences do not make the test
+    # stricter.
     others = [np.median(np.delete(squares, n)) for n in range(len(squares))] if len(squares) > 1 else [0.0]
-    degrees = MEDIAN_EFFICIENCY * _AXES * (len(squares) - 1)
-    factor = (_BELIEVED_DEGREES + degrees * np.array(others) / chdtri(_AXES, 0.5)) / (_BELIEVED_DEGREES + degrees)
-    # A variance factor below 1 is not applied: small differences do not make the test stricter.
-    return np.asarray(fdtrc(_AXES, _BELIEVED_DEGREES + degrees, squares / _AXES / np.maximum(factor, 1.0)))
-
-
-def _doubt_edges(mark: MarkMeasurement, is_alone: bool) -> MarkMeasurement:
-    before = np.asarray(mark.covariance_px2)
-    off_px = float(np.hypot(mark.quality["second_method_col_px"], mark.quality["second_method_row_px"]))
-    is_weak = is_alone or (may_be_wrong(before + off_px**2 / 2 * np.eye(2)) and not may_be_wrong(before))
-    reason = Reason(
-        f"its edges put it {off_px:#.2g} px elsewhere, {mark.quality[_SIGMAS]:.1f} standard deviations of the "
-        "difference: it is damaged, or not as drawn",
-        Code.EDGES,
-    )
-    return _doubt(mark, Cause.SECOND_METHOD, off_px**2 / 2, reason if is_weak else NO_REASON)
+    known = MEDIAN_EFFICIENCY * _AXES * (len(squares) - 1)
+    degrees = _BELIEVED_DEGREES + known
+    factor = np.maximum((_BELIEVED_DEGREES + known * np.array(others) / chdtri(_AXES, 0.5)) / degrees, 1.0)
+    is_alone = fdtrc(_AXES, degrees, squares / _AXES / factor) * len(squares) < FALSE_DOUBT
+    changed: list[dict[str, MarkMeasurement]] = [{} for _ in frames]
+    for index in np.flatnonzero(chdtrc(_AXES, squares) * len(squares) < FALSE_DOUBT).tolist():
+        number, mark = tested[index]
+        before = np.asarray(mark.covariance_px2)
+        off_px = float(np.hypot(mark.quality["second_method_col_px"], mark.quality["second_method_row_px"]))
+        is_weak = is_alone[index] or (may_be_wrong(before + off_px**2 / 2 * np.eye(2)) and not may_be_wrong(before))
+        reason = Reason(
+            f"its edges put it {off_px:#.2g} px elsewhere, {mark.quality[_SIGMAS]:.1f} standard deviations of the "
+            "difference: it is damaged, or not as drawn",
+            Code.EDGES,
+        )
+        doubted = _doubt(mark, Cause.SECOND_METHOD, off_px**2 / 2, reason if is_weak else NO_REASON)
+        changed[number][mark.point] = doubted
+    return [_replace_marks(*each) for each in zip(frames, changed, strict=True)]

@@ -13,11 +13,10 @@ from scipy.special import comb
 from measure.detection.localisation import localise
 from measure.detection.responses import Effort
 from measure.fiducials.constellation import Placement, distinct_places
-from measure.fiducials.frame import Frame
-from measure.fiducials.measure_frame import detect_frame
+from measure.fiducials.frame import Frame, detect_frame
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import FrameSearch, PitchHypothesis
-from measure.fiducials.significance import false_placements
+from measure.fiducials.stages import false_placements
 from measure.flags import CAMERA_BY_NOISE, MAX_FALSE_CAMERAS
 from measure.marks.shapes import FiducialLayout
 from measure.matching.models import MatchOptions
@@ -60,34 +59,27 @@ def recognise_frame(scan: Scan, layout: FiducialLayout, answered: Answer, times:
     times : pixels of the scan for one pixel of the thumbnail, along a side.
     """
     for placement in answered.placements[:_PLACES]:
-        enlarged = _enlarged(placement, times)
-        if answered.expected <= MAX_FALSE_CAMERAS or _may_be_there(scan, layout, enlarged):
-            # All marks count in the score: without the missing ones, a camera of eight loses to one that has four.
-            frame = detect_frame(scan, layout, enlarged, _QUICK_OPTIONS)
-            if frame.accepted:
-                return frame
+        pixel_from_camera = times * placement.pixel_from_camera
+        pixel_from_camera[:, 2] += (times - 1) / 2
+        enlarged = replace(
+            placement,
+            pixel_from_camera=pixel_from_camera,
+            pitch_mm=(placement.pitch_mm[0] / times, placement.pitch_mm[1] / times),
+            reduction=int(np.ceil(times * placement.reduction)),
+        )
+        if answered.expected > MAX_FALSE_CAMERAS:
+            # Whether its most significant peaks are improbable as noise is found ten times as fast as by a fit.
+            frame = Frame.from_placement(scan, layout, enlarged, _QUICK_OPTIONS)
+            indices = range(len(layout.marks))
+            peaks = [localise(scan, frame.prediction(index, frame.first_search_px)) for index in indices]
+            false_alarms = np.sort([1.0 if peak is None else peak[1] for peak in peaks])[:_AT_LEAST]
+            if not comb(len(peaks), len(false_alarms)) * false_alarms.prod() <= CAMERA_BY_NOISE:
+                continue
+        # All marks count in the score: without the missing ones, a camera of eight loses to one that has four.
+        frame = detect_frame(scan, layout, enlarged, _QUICK_OPTIONS)
+        if frame.accepted:
+            return frame
     return None
-
-
-def _may_be_there(scan: Scan, layout: FiducialLayout, placement: Placement) -> bool:
-    """Whether the three most significant peaks are improbable as noise: ten times as fast as a fit."""
-    frame = Frame.from_placement(scan, layout, placement, _QUICK_OPTIONS)
-    peaks = [localise(scan, frame.prediction(index, frame.first_search_px)) for index in range(len(layout.marks))]
-    false_alarms = np.sort([1.0 if peak is None else peak[1] for peak in peaks])[:_AT_LEAST]
-    return bool(comb(len(peaks), len(false_alarms)) * false_alarms.prod() <= CAMERA_BY_NOISE)
-
-
-def _enlarged(placement: Placement, times: float) -> Placement:
-    """Convert a placement to a scan with times as many pixels along a side."""
-    pixel_from_camera = times * placement.pixel_from_camera
-    pixel_from_camera[:, 2] += (times - 1) / 2
-    x, y = placement.pitch_mm
-    return replace(
-        placement,
-        pixel_from_camera=pixel_from_camera,
-        pitch_mm=(x / times, y / times),
-        reduction=int(np.ceil(times * placement.reduction)),
-    )
 
 
 def likeness(frame: Frame) -> float:

@@ -123,24 +123,15 @@ class FrameMarks:
         x, y = self.given_mm.T
         return interleaved((x, y), (x, -y), (y, x))
 
-    @cached_property
-    def perspective(self) -> Array:
-        """(2n, 2) derivatives with respect to a perspective, per mm of displacement of the outermost mark."""
-        return film_terms("projective", self.given_mm, self.given_mm + self.off_mm) / self.radius_mm**2
-
-    @cached_property
-    def beyond_jumps(self) -> Mask:
-        """(n, j) marks beyond each column or row of the scan at which a jump may lie."""
-        least_mm, sides = _APART * float(pdist(self.scan_mm).min()), list[Mask]()
+    def shift_derivatives(self, reduced: "Reduced") -> tuple[Any, Any]:
+        """(n + j, m) derivatives of the misfit by a shift along x and y of each mark, and of those beyond each column
+        or row of the scan at which a jump may lie."""
+        least_mm, beyond = _APART * float(pdist(self.scan_mm).min()), list[Mask]()
         for place in self.scan_mm.T:
             steps = np.sort(place)
-            sides += [place > steps[k] for k in np.flatnonzero(np.diff(steps) > least_mm)]
-        kept = [each for each in sides if _FEWEST_BEYOND <= each.sum() <= len(each) - _FEWEST_BEYOND]
-        return np.array(kept, dtype=bool).reshape(-1, len(self.scan_mm)).T
-
-    def shift_derivatives(self, reduced: "Reduced") -> tuple[Any, Any]:
-        """(n + j, m) derivatives of the misfit by a shift along x and y of each mark, and of those beyond each jump."""
-        groups: Any = np.vstack([np.eye(len(self.given_mm)), self.beyond_jumps.T])
+            beyond += [place > steps[k] for k in np.flatnonzero(np.diff(steps) > least_mm)]
+        jumps = [each for each in beyond if _FEWEST_BEYOND <= each.sum() <= len(each) - _FEWEST_BEYOND]
+        groups: Any = np.vstack([np.eye(len(self.given_mm)), *jumps])
         groups = groups if isinstance(reduced.axes, np.ndarray) else csr_array(groups)
         return groups @ reduced.axes[::2], groups @ reduced.axes[1::2]
 
@@ -218,10 +209,6 @@ class FrameMarks:
         included."""
         reduced = self.beyond_affine
         return np.asarray(np.hypot(*(reduced.axes @ reduced.residuals).reshape(-1, 2).T))
-
-    def expecting(self, off_mm: Array, covariance_mm2: Array) -> "FrameMarks":
-        """Subtract an expected misfit off_mm (n, 2) with its covariance (2n, 2n)."""
-        return replace(self, off_mm=self.off_mm - off_mm, shared_mm2=covariance_mm2)
 
     def widen(self, variances_mm2: Array) -> "FrameMarks":
         """Add variances (n,) to both coordinates of each mark."""
@@ -463,7 +450,9 @@ def frame_consistency(
     hypotheses, films_mm2, effects_mm2, log_prior = _states(marks, film, affinity)
     reduced = marks.beyond_congruent
     residuals = reduced.principal(marks.off_mm.ravel() - marks.affine @ affinity.mean)
-    weight = reduced.weigh(films_mm2, np.column_stack([marks.affine, marks.perspective]), np.sqrt(effects_mm2))
+    # A perspective, per mm of displacement of the outermost mark.
+    perspective = film_terms("projective", marks.given_mm, marks.given_mm + marks.off_mm) / marks.radius_mm**2
+    weight = reduced.weigh(films_mm2, np.column_stack([marks.affine, perspective]), np.sqrt(effects_mm2))
     chi_square = weight.products(residuals[:, None])[:, 0, 0]
     known = log_prior - 0.5 * (weight.log_determinant + chi_square)
     pulls, blocks = weight.shifts(residuals, *marks.shift_derivatives(reduced))

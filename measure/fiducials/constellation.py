@@ -5,7 +5,6 @@ Places are complex numbers here, x + iy in mm of the scan's axes (right, up), so
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ from measure.detection.correlation import WIDE, Surroundings
 from measure.detection.responses import Key, Responses
 from measure.fiducials.interior_orientation import FilmFit
 from measure.fiducials.options import TakingLens
-from measure.geometry import UP_FROM_CAMERA, Affine, linear_scale
+from measure.geometry import UP_FROM_CAMERA, linear_scale
 from measure.marks.shapes import LayoutMark, Mark
 
 Complex = NDArray[np.complex128]
@@ -131,8 +130,9 @@ class Placement:
         own, other = self._ideal_px(camera_mm), renamed._ideal_px(camera_mm)[names]
         to, from_ = ((each * pitch) @ (1.0, 1.0j) for each in (own, other))
         correction = _similarity_matrix(*_fit_similarity(from_, to, np.ones(len(to))))
-        moved = Affine(correction).compose(Affine(renamed.pixel_from_camera * pitch[:, None])).matrix
-        return replace(renamed, pixel_from_camera=moved / pitch[:, None])
+        before = renamed.pixel_from_camera * pitch[:, None]
+        linear, shift = correction[:, :2] @ before[:, :2], before[:, 2] @ correction[:, :2].T + correction[:, 2]
+        return replace(renamed, pixel_from_camera=np.column_stack([linear, shift]) / pitch[:, None])
 
 
 def distinct_places(found: Iterable[Placement], most: int) -> list[Placement]:
@@ -187,16 +187,12 @@ def mark_sign(mark: Mark, assumed: int) -> int:
     return {"light": 1, "dark": -1, "auto": assumed}[mark.polarity]
 
 
-def mark_signs(marks: Sequence[LayoutMark]) -> set[int]:
-    """Signs that the marks can have."""
-    return {mark_sign(mark.mark, assumed) for mark in marks for assumed in (1, -1)}
-
-
 class PlacementSearch:
     """Search for placements of a frame under one pitch, in one scan orientation after another.
 
     Attributes
     ----------
+    steps_mm : (n, 2) steps of a lattice of marks; none if they form no lattice.
     tolerance_px : deviation allowed to a mark, px of the reduced scan.
     kinds : by orientation, the kind of template of every mark.
     placements : by orientation. An orientation with equal marks at the places of an earlier one gets the placements of
@@ -215,6 +211,7 @@ class PlacementSearch:
         self.marks, self.responses, self.bounds, self.lens = marks, responses, bounds, lens
         self.camera_mm = np.array([mark.xy_mm for mark in marks])
         self.pitch_mm, self.pitch = pitch_mm, np.asarray(pitch_mm)
+        self.steps_mm = lattice_steps_mm(self.camera_mm, bounds.misfit_mm)
         self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, _LEAST_TOLERANCE_PX)
         self.kinds: dict[str, tuple[int, ...]] = {}
         self.placements: dict[str, list[Placement]] = {}
@@ -238,11 +235,6 @@ class PlacementSearch:
     def key(self, placement: Placement, index: int) -> Key:
         """Key of the responses to a mark, by index, in the orientation and polarity of a placement."""
         return self.kinds[placement.pose][index], mark_sign(self.marks[index].mark, placement.polarity)
-
-    @cached_property
-    def steps_mm(self) -> Array:
-        """(n, 2) steps of a lattice of marks; none if they form no lattice."""
-        return lattice_steps_mm(self.camera_mm, self.bounds.misfit_mm)
 
     def find_placements(self, pose: str, kinds: Sequence[int]) -> list[Placement]:
         """Find the distinct placements of an orientation, best first; none if no two marks respond.
@@ -318,7 +310,12 @@ class _Constellation:
         candidates = {key: self._complex(self.responses.candidates(key)) for key in dict.fromkeys(self.keys)}
         scales, offsets = [np.zeros(0, complex)], [np.zeros(0, complex)]
         upright = np.cos(bounds.rotation_rad)
-        for first, second in self._pairs():
+        # Of pairs of distant marks; an even selection if there are too many.
+        ends = np.stack(np.triu_indices(len(self.camera), 1))
+        length = np.abs(self.camera[ends[0]] - self.camera[ends[1]])
+        far = np.flatnonzero(length >= _FAR * length.max())
+        chosen = far[(np.arange(min(len(far), _PAIRS)) * max(1.0, len(far) / _PAIRS)).astype(int)]
+        for first, second in ends[:, chosen].T.tolist():
             of_first, of_second = candidates[self.keys[first]], candidates[self.keys[second]]
             base = self.camera[second] - self.camera[first]
             scale = (of_second[None, :] - of_first[:, None]) / base
@@ -328,15 +325,6 @@ class _Constellation:
             scales.append(scale.ravel()[at])
             offsets.append(of_first[at // len(of_second)] - scales[-1] * self.camera[first])
         return np.concatenate(scales), np.concatenate(offsets)
-
-    def _pairs(self) -> list[tuple[int, int]]:
-        """Pairs of distant marks; an even selection if there are too many."""
-        first, second = np.triu_indices(len(self.camera), 1)
-        length = np.abs(self.camera[first] - self.camera[second])
-        far = np.flatnonzero(length >= _FAR * length.max())
-        step = max(1.0, len(far) / _PAIRS)
-        chosen = far[(np.arange(min(len(far), _PAIRS)) * step).astype(int)]
-        return list(zip(first[chosen].tolist(), second[chosen].tolist(), strict=True))
 
     def _scores(self, radius_px: float, scale: Complex, offset: Complex) -> tuple[Array, Array]:
         """Scores of many placements, and numbers of their marks that respond within the radius."""

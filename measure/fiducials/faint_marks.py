@@ -1,4 +1,4 @@
-"""Detection of the faint marks of a frame at places predicted from its inliers, against the texture around them.
+"""Detection of a faint mark at the place predicted from a frame's other marks, against the texture around it.
 
 Alone, such a mark cannot be distinguished from the many places where noise resembles it. With a certain constellation
 only responses as strong and as close to the predicted place compete. Their expected number follows from the texture
@@ -14,26 +14,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.array_types import Array, Mask, Single
+from measure.array_types import Array, Mask
 from measure.detection.localisation import MarkPrediction
-from measure.fiducials.frame import Frame
-from measure.fiducials.mark_fit import Detection
-from measure.flags import NO_REASON, TEXTURE_LIKE_A_FAINT_MARK, Cause, Code, Reason
+from measure.flags import NO_REASON, Cause, Code, Reason
 from measure.marks.rendering import detail_px, extent_px, picture
-from measure.marks.shapes import FrameCorner, Mark
 from measure.matching.window import FAINT, Coding
 from measure.results import Covariance, MarkFit
 from measure.scans.scan import Scan, means
 
-_FAINT_CONTRAST = 1 / 250  # fraction of full scale: less is one grey level of 8 bits, or a compression artefact
-_FAINT_SIGMA_PX = 0.75  # px, largest standard deviation of a measured faint mark
-_LEAST_REACH_PX = 3.0  # px: film deformation displaces single marks so far, however well most agree
-_SAME_PX = 1.0  # px between two places of one mark at most; each is more accurate than that
-_REACH = 4.0  # times the median misfit of the inliers: nearly five standard deviations
-_NEAR = 2.0  # times the same: one good mark in sixteen lies farther off
-_EXTREMES = (0.5, 99.5)  # percentiles of the grey values taken as darkest and lightest
-_SURROUND = 6.0  # times a mark's own extent: enough of the scan for its darkest and lightest grey values
-_TYPICAL = 8  # inliers from which the usual grey values of marks are taken
 _SHOWS = 1 / 3  # fraction of the usual contrast: a background that leaves less to a mark hides it
 _BACKGROUND = 1.2  # in widths of the finest detail, standard deviation of the blur that estimates the background
 _TEXTURE = 2.0  # times that, standard deviation of the average of the texture's strength
@@ -71,84 +59,7 @@ class FaintMark:
         return float(np.sqrt(np.linalg.eigvalsh(place_px2)[-1]))
 
 
-def faint_reach_px(frame: Frame) -> float:
-    """Search radius around a place predicted from many other marks."""
-    return min(frame.gate_px, max(_REACH * frame.scatter_mm / float(frame.pitch_mm.mean()), _LEAST_REACH_PX))
-
-
-def detect_faint_marks(frame: Frame, reach_px: float) -> Frame:
-    """Detect again every mark that is not clear or deviates from its predicted place.
-
-    A candidate that stands out from the texture there is taken for the mark; its deviation is film deformation. A clear
-    fit farther off may be a pattern beside the mark.
-    """
-    near = frame.inliers & (frame.misfit_mm <= _NEAR * max(frame.scatter_mm, frame.options.film_sigma_mm))
-    inside = [index for index, detection in enumerate(frame.detections) if detection.inside]
-    faint = [
-        index
-        for index in inside
-        if not (frame.detections[index].is_clear and near[index])
-        if not isinstance(frame.layout.marks[index].mark, FrameCorner)  # it has no lines that stand out from texture
-    ]
-    fits = frame.inlier_fits
-    if not faint or not fits:
-        return frame
-    # Blur and contrast come from the inliers: a faint mark gives both less accurately.
-    blur_px = float(np.median([fit.blur_px for fit in fits.values()]))
-    usual_dn = float(np.median([abs(fit.stored_contrast_dn) for fit in fits.values()]))
-    marks, predictions = frame.layout.marks, [frame.prediction(index, 0.0) for index in inside]
-    # Darkest and lightest grey values around the marks, which are spread over the scan; and those that light and dark
-    # inliers have, which may exceed them.
-    around = [_surrounding_grey(frame, each.mark, each.pixel_from_mark, _SURROUND) for each in predictions]
-    extremes = np.percentile(np.concatenate(around), _EXTREMES, overwrite_input=True)  # spares a copy of much of a scan
-    usual: dict[int, list[float]] = {}
-    for index, fit in list(fits.items())[:_TYPICAL]:
-        grey, sign = _surrounding_grey(frame, marks[index].mark, fit.pixel_from_mark), 1 if fit.contrast_dn > 0 else -1
-        usual.setdefault(sign, []).append(float(np.percentile(grey, _EXTREMES[int(sign > 0)])))
-    detections, certain = {}, frame.certain.copy()
-    for index in faint:
-        expected = frame.prediction(index, reach_px)
-        extreme_dn = float(extremes[int(expected.polarity > 0)])
-        mark = detect_faint(frame.scan, expected, extreme_dn, blur_px)
-        is_certain = mark is not None and _is_certain(frame.scan, mark)
-        grey = _surrounding_grey(frame, expected.mark, expected.pixel_from_mark)
-        tones_dn = extreme_dn, float(np.median(usual.get(expected.polarity, [extreme_dn])))
-        room_dn = max(*(expected.polarity * (tone_dn - float(np.median(grey))) for tone_dn in tones_dn), 0.0)
-        why_not = _reason_not_found(expected, (room_dn, usual_dn, float(grey.std())), mark, is_certain)
-        known = mark if is_certain and mark is not None and mark.sigma_px <= _FAINT_SIGMA_PX else None
-        detections[index], certain[index] = _decide(frame, index, known, why_not)
-    return replace(frame.replace_detections(detections), certain=certain)
-
-
-def _surrounding_grey(frame: Frame, mark: Mark, pixel_from_mark: Array, times: float = 1.0) -> Single:
-    """(n,) grey values in a mark's bounding rectangle, enlarged by a factor."""
-    center = pixel_from_mark[:, 2]
-    least, greatest = (center + times * (corner - center) for corner in extent_px(mark, pixel_from_mark))
-    low, size = np.floor(least).astype(int), np.ceil(greatest - least).astype(int) + 1
-    window = frame.scan.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]), frame.weights)
-    return np.asarray(window, np.float32).ravel()
-
-
-def _decide(frame: Frame, index: int, mark: FaintMark | None, why_not: Reason) -> tuple[Detection, bool]:
-    """Choose between the earlier detection of a mark and the faint one; returns also whether it is certain."""
-    before, is_clear = frame.detections[index], frame.detections[index].is_clear
-    if mark is None:
-        return before if is_clear else Detection(before.predicted_px, True, None, why_not), False
-    away_px = np.inf if before.fit is None else float(np.hypot(*(before.fit.center_px - mark.fit.center_px)))
-    if is_clear and away_px <= _SAME_PX:
-        # A second detection from the same pixels is no new evidence for a clear inlier.
-        return before, bool(frame.certain[index]) or not frame.inliers[index]
-    second = Reason(f"{away_px:.0f} px from it is a second candidate", Code.AMBIGUOUS)
-    return Detection(before.predicted_px, True, mark.fit, second if is_clear else NO_REASON), True
-
-
-def _is_certain(scan: Scan, mark: FaintMark) -> bool:
-    """Whether the mark is significant against texture and rounding."""
-    strong = abs(mark.fit.stored_contrast_dn) >= _FAINT_CONTRAST * scan.full_scale_dn
-    return mark.false_alarms <= TEXTURE_LIKE_A_FAINT_MARK and strong
-
-
-def _reason_not_found(
+def reason_not_found(
     expected: MarkPrediction, contrasts_dn: tuple[float, float, float], mark: FaintMark | None, is_certain: bool
 ) -> Reason:
     """Give the first reason that holds: no room for contrast, too little of it visible, rounding, or texture.
@@ -291,7 +202,13 @@ class _Field:
         bend = response.bend(own)[1]
         if texture.sum() < _LEAST_PLACES or not np.all(np.linalg.eigvalsh(bend) < 0):
             return None
-        slopes = np.asarray(np.cov(response.slopes()[:, texture]), dtype=float)
+        # Derivatives of the correlation with respect to column and row.
+        nine = response.templates
+        by_col, by_row = (
+            _correlated(self.weighted, by) / (2 * _STEP_PX) / response.norm
+            for by in (nine[1, 2] - nine[1, 0], nine[2, 1] - nine[0, 1])
+        )
+        slopes = np.asarray(np.cov(np.stack([by_col, by_row])[:, texture]), dtype=float)
         scatter = float(np.sqrt(np.mean(response.value[texture] ** 2)))
         inverse, place = np.linalg.inv(bend) * self.step, center * self.step + self.origin
         lines = np.abs(response.template)
@@ -395,11 +312,6 @@ class _Response:
         mixed = (nine[2, 2] + nine[0, 0] - nine[0, 2] - nine[2, 0]) / 4
         bends = [side[2] - 2 * side[1] + side[0] for side in (by_col, by_row)]
         return gradient, np.array([[bends[0], mixed], [mixed, bends[1]]]) / _STEP_PX**2
-
-    def slopes(self) -> Array:
-        """(2, rows, cols) derivatives of the correlation with respect to column and row."""
-        by_col, by_row = (self.templates[1, 2] - self.templates[1, 0], self.templates[2, 1] - self.templates[0, 1])
-        return np.stack([_correlated(self.field.weighted, by) / (2 * _STEP_PX) / self.norm for by in (by_col, by_row)])
 
 
 def _correlated(image: NDArray[np.floating], template: NDArray[np.floating]) -> Array:

@@ -14,14 +14,11 @@ import numpy as np
 from scipy.special import ndtr
 
 from measure.array_types import Array, Mask
-from measure.fiducials.frame import WRONG_PX, Frame
-from measure.fiducials.mark_fit import Detection
-from measure.flags import FALSE_DOUBT, LARGE_ERROR, MARK_UNLIKE_THE_OTHERS, NO_REASON, Cause, Code, Reason, Status
-from measure.geometry import linear_scale
-from measure.marks.rendering import mark_window, picture, reach_px
-from measure.marks.shapes import Bar, Disk, Mark, MarkShape, Ring
+from measure.flags import FALSE_DOUBT, MARK_UNLIKE_THE_OTHERS, NO_REASON, Code, Reason, Status
+from measure.marks.rendering import picture
+from measure.marks.shapes import Bar, MarkShape
 from measure.matching.models import PIXEL_VARIANCE_PX2, background_planes
-from measure.matching.window import ScanWindow, read_window
+from measure.matching.window import ScanWindow
 from measure.results import FrameMeasurement, MarkFit, MarkMeasurement
 
 _FEWEST_BLURS = 3  # other marks needed to estimate their scatter in blur
@@ -37,10 +34,8 @@ _WHOLE, _DAMAGED = 0.01, 0.03
 # Specks do not depend on the size of the mark: rms displacement of the mean outline of a touched round mark,
 # multiplied by its radius. Five touched dots of 0.15 mm had it displaced by 8 um.
 _SPECK_MM2 = 0.00125
-_TOUCHED_PX = 0.3  # rms displacement of the edges of wedges and notches that the background touches
 # A local displacement of an outline shifts the centre by twice as much as it changes the mean radius.
 _AS_MUCH = 2.0
-_MOST_UNEQUAL = 10.0  # logarithm of a size ratio: the edges of a wedge may leave its size open by any amount
 _FEWEST_FRAMES = 3  # needed: of two, either may be the outlier
 _NEAR = 3.0  # standard deviations from the median, within which frames agree
 _WIDTH_SIGMA = 0.15  # standard deviation of the logarithm of the width of a frame's lines over the drawn one
@@ -262,74 +257,6 @@ def touch_of_round(shape: SharedShape, radius_px: float, px_per_mm: float, is_da
     return Touch(shape.touched(spread, is_damaged), moved, sigma)
 
 
-def touch_of_edges(shape: SharedShape, on_place: Array, middle_px: float, is_damaged: bool) -> Touch:
-    """Estimate the displacement of a wedge or notch from its own scale and rotation.
-
-    on_place: (2, k) derivatives of the place with respect to these; middle_px: mean distance of the edges from the
-    measured point.
-    """
-    return Touch(shape.touched(_TOUCHED_PX / middle_px, is_damaged), float(np.hypot(*(on_place @ shape.off))), 0.0)
-
-
-def compare_shapes(frame: Frame) -> Frame:
-    """Doubt marks with an outlying size or rotation; each covariance grows by what an object touching it may cause."""
-    fits = {index: fit for index, fit in frame.clear_fits.items() if fit.covariance is not None}
-    groups: dict[Mark | None, list[int]] = defaultdict(list)
-    for index, fit in fits.items():
-        mark = frame.layout.marks[index].mark
-        if isinstance(mark, MarkShape) and not mark.is_held_by_frame:
-            groups[mark].append(index)
-        elif isinstance(mark, MarkShape) and fit.own_shape is not None:
-            groups[None].append(index)
-    changed = {}
-    for drawn, indices in groups.items():
-        figures = [_shape_figures(fits[index], frame.linear(index), drawn is None) for index in indices]
-        own, sigmas = (np.array(each) for each in zip(*figures, strict=True))
-        for index, shape, sigma in zip(indices, shared_shapes(own, sigmas), sigmas, strict=True):
-            if shape is not None:
-                changed[index] = _doubt_shape(frame, index, fits[index], shape, sigma)
-    return frame.replace_detections(changed)
-
-
-def _shape_figures(fit: MarkFit, linear: Array, is_held: bool) -> tuple[Array, Array]:
-    """Log ratio of a mark's size to the frame's, and its rotation (rad) if the frame gave it; standard deviations."""
-    if is_held and fit.own_shape is not None:
-        return fit.own_shape.change, fit.own_shape.sigma
-    return np.array([np.log(linear_scale(fit.pixel_from_mark) / linear_scale(linear))]), np.array([fit.size_sigma])
-
-
-def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape, sigma: Array) -> Detection:
-    """Store the shape of a mark relative to the others, and doubt an outlier. sigma (k,): of the mark's own figures."""
-    mark, is_damaged, touch = frame.layout.marks[index].mark, fit.damaged_fraction > 0, None
-    size_ratio = float(np.exp(np.clip(shape.off[0], -_MOST_UNEQUAL, _MOST_UNEQUAL)))
-    figures = dict(zip(("size_ratio", "turn_rad"), (size_ratio, *shape.off[1:].tolist()), strict=False))
-    figures |= dict(zip(("size_sigma", "turn_sigma"), sigma.tolist(), strict=False))
-    if isinstance(mark, MarkShape) and mark.is_cross:
-        place = np.column_stack([frame.linear(index), fit.center_px])
-        window = read_window(frame.scan, mark_window(mark, place, frame.options.match.margin_px), frame.weights)
-        for number, (length, sigma_length) in enumerate(zip(*measure_arms(window, mark, place, fit), strict=True), 1):
-            figures |= {f"arm{number}_ratio": float(length), f"arm{number}_sigma": float(sigma_length)}
-    unlike = unlike_others(figures["size_ratio"], figures.get("turn_rad"))
-    if fit.own_shape is not None and mark.is_held_by_frame:
-        middle_px = reach_px(mark, fit.pixel_from_mark[:, :2]) / 2
-        touch = touch_of_edges(shape, fit.own_shape.on_place, middle_px, is_damaged)
-    elif mark.is_round:
-        px_per_mm = linear_scale(fit.pixel_from_mark)
-        touch = touch_of_round(shape, _radius_mm(mark) * px_per_mm, px_per_mm, is_damaged)
-    reasons = [unlike] if shape.differs else []
-    if not reasons and touch and mark.is_round and is_damaged and touch.exceedance(WRONG_PX) > LARGE_ERROR:
-        near = f"and the picture next to it is damaged: something may touch it; error over {WRONG_PX} px"
-        reasons = [unlike.reword(f"{unlike.split(':')[0]}, {near}")]
-    parts = {} if touch is None else {Cause.TOUCHED: touch.variance_px2 * np.eye(2)}
-    return frame.detections[index].amend(*reasons, parts=parts, figures=figures)
-
-
-def _radius_mm(mark: Mark) -> float:
-    """Radius of the outline of a round mark."""
-    parts = mark.parts if isinstance(mark, MarkShape) else ()
-    return max(part.radius_mm for part in parts if isinstance(part, Disk | Ring))
-
-
 def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fit: MarkFit) -> tuple[Array, Array]:
     """Estimate the lengths of the arms of a cross, relative to the drawn ones, by linear least squares.
 
@@ -473,14 +400,11 @@ def _assess(mark: MarkMeasurement, findings: Mapping[str, Reason], arms: Sequenc
     settled = set[str]()
     if not findings.get(_BLUR, True):
         settled.add(unlike_blur(quality["blur_ratio"]))
-    if not findings.get(_SHAPE, True) and _explains(arms, quality):
-        settled.add(unlike_others(quality["size_ratio"], quality.get("turn_rad")))
+    if not findings.get(_SHAPE, True):
+        # The arms of a cross have to explain its size: a match yields a size between those of its arms.
+        size = float(np.log(quality["size_ratio"]))
+        near = _NEAR * float(np.hypot(quality["size_sigma"], _SIZE_SPREAD))
+        if not arms or min(arms) - near <= size <= max(arms) + near:
+            settled.add(unlike_others(quality["size_ratio"], quality.get("turn_rad")))
     is_settled = mark.status is Status.WEAK and settled.issuperset(mark.reason.split("; "))
     return replace(mark, status=Status.MEASURED, reason=NO_REASON) if is_settled else mark
-
-
-def _explains(arms: Sequence[float], quality: Mapping[str, float]) -> bool:
-    """Whether the arms of a cross, if it has any, explain its size: a match yields a size between those of its arms."""
-    size = float(np.log(quality["size_ratio"]))
-    near = _NEAR * float(np.hypot(quality["size_sigma"], _SIZE_SPREAD))
-    return not arms or min(arms) - near <= size <= max(arms) + near

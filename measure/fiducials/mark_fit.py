@@ -92,8 +92,14 @@ def detect_mark(
             scan, mark, expected.pixel_from_mark, expected.search_px, expected.polarity, expected.weights
         )
     elif peak := localise(scan, expected) if expected.search_px > 0 else (predicted, 0.0):
-        false_alarms = peak[1]
-        fit = _match(scan, expected.shift_to(peak[0]), options_for(mark, options, frame_sigma), before)
+        start, false_alarms = expected.shift_to(peak[0]).pixel_from_mark, peak[1]
+        options = options_for(mark, options, frame_sigma)
+        coded = scan.replace_tone(LINEAR) if isinstance(mark, MarkTemplate) else scan  # stored values
+        window = read_window(coded, mark_window(mark, start, options.margin_px + BESIDE_PX), expected.weights)
+        if expected.surroundings.robust and isinstance(mark, MarkShape):
+            inner = np.column_stack([start[:, :2], start[:, 2] - window.origin_px])
+            window = window.exclude(pixels_beyond_edge(window.grey, mark, inner))
+        fit = match(window, mark, start, options, before)
     place = expected.shift_to(fit.center_px) if fit is not None and fit.converged else expected
     if why := scan.loss_reason(*mark_window(mark, place.pixel_from_mark, 0.0)):
         lost = Reason(f"the scan's file is damaged at its place: {why}", Code.DAMAGED_FILE)
@@ -109,17 +115,6 @@ def detect_mark(
     loss = covariance_of_compression(scan.rounding_step_dn, fit.stored_contrast_dn)
     fit = replace(fit, place_covariance=fit.place_covariance.plus(Cause.COMPRESSION, loss))
     return Detection(predicted, True, fit, false_alarms=false_alarms)
-
-
-def _match(scan: Scan, expected: MarkPrediction, options: MatchOptions, before: MarkFit | None) -> MarkFit:
-    """Match the mark from its predicted place."""
-    mark, start = expected.mark, expected.pixel_from_mark
-    coded = scan.replace_tone(LINEAR) if isinstance(mark, MarkTemplate) else scan  # stored values
-    window = read_window(coded, mark_window(mark, start, options.margin_px + BESIDE_PX), expected.weights)
-    if expected.surroundings.robust and isinstance(mark, MarkShape):
-        inner = np.column_stack([start[:, :2], start[:, 2] - window.origin_px])
-        window = window.exclude(pixels_beyond_edge(window.grey, mark, inner))
-    return match(window, mark, start, options, before)
 
 
 def not_found(search_px: float) -> Reason:

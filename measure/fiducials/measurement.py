@@ -1,4 +1,7 @@
-"""Fiducials of one scan: found by their constellation, named by the scan orientation, measured at full resolution."""
+"""Fiducials of one scan: found by their constellation, named by the scan orientation, measured at full resolution.
+
+The result has a row for each mark, found or not, and the problems of the frame.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,22 +12,28 @@ from scipy.spatial import cKDTree
 from measure.annotations.lines import KnownLine, Line
 from measure.annotations.text import networks, read_writing
 from measure.array_types import Array
-from measure.fiducials.clicked_frame import clicked_frame, contradicted_pose, is_shown, place_clicked_marks
+from measure.fiducials.clicked_frame import clicked_frame
 from measure.fiducials.constellation import Placement
-from measure.fiducials.frame import Frame
-from measure.fiducials.measure_frame import measure_frame, rename_frame
-from measure.fiducials.options import FiducialOptions
-from measure.fiducials.rows import absent_frame, lost_frame, present_frame
+from measure.fiducials.frame import Frame, measure_frame, rename_frame
+from measure.fiducials.interior_orientation import AFFINITY_SIGMA
+from measure.fiducials.mark_fit import Detection
+from measure.fiducials.options import CLICK_SIGMA_PX, Click, FiducialOptions
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import SearchResult
-from measure.fiducials.significance import doubt_frame, false_placements
-from measure.fiducials.stages import find_frame
-from measure.flags import MAX_FALSE_FRAMES, NO_REASON, Code, Reason, Status
+from measure.fiducials.stages import doubt_frame, false_placements, find_frame
+from measure.flags import MAX_FALSE_FRAMES, NO_REASON, Cause, Code, Reason, Status
 from measure.geometry import UP_FROM_CAMERA
-from measure.marks.shapes import FiducialLayout, limit_to_crossings, limit_to_frame
-from measure.results import FrameMeasurement, ScanOrientation
-from measure.scans.opening import crop_scan
-from measure.scans.remote import Window
+from measure.marks.shapes import (
+    FiducialLayout,
+    LayoutMark,
+    MarkTemplate,
+    finest_detail_mm,
+    limit_to_crossings,
+    limit_to_frame,
+)
+from measure.matching.covariance import honest_covariance
+from measure.noise.resampling import NEAREST_PX2, is_nearest_neighbour
+from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
 from measure.scans.scan import Scan
 
 _SET = ("set in the project.",)
@@ -38,9 +47,16 @@ _OBLIQUE = Reason(
 _BESIDE = 0.95  # fraction of the frame's size: a rival shifted by more is another photograph
 _AMBIGUOUS = 0.9  # fraction of the best score from which another placement is a rival
 _HARDLY = 0.5  # times the fraction of all marks found
-_ROOM = 0.9  # fraction of the frame's sides: a free margin narrower than this holds no second frame
-_MOST_MARKS = 0.75  # fraction of the layout's marks that must be measured in a second frame
-_FEWEST_MARKS = 3
+_PLAIN_PX = 3.0  # px across the finest line of a mark: both edges and the inside are resolved
+_ASSUMED = Reason(
+    "the scan orientation is only assumed, and another of the learned marks would have its origin elsewhere", Code.POSE
+)
+_NEAREST = Reason(
+    "The scan was turned or enlarged with nearest neighbours: each of its marks may lie half a pixel off. Measure the "
+    "scan that it was made from, or turn that with interpolation.",
+    Code.IMPRECISE,
+)
+_OWN = Reason("its template is its own picture: nothing checks its place", Code.OWN_PICTURE)
 
 
 def measure_fiducials(
@@ -64,25 +80,22 @@ def measure_fiducials(
     options = options or FiducialOptions()
     layout = limit_to_crossings(limit_to_frame(layout))
     if scan.is_lost:
-        return lost_frame(scan, layout)
-    if is_shown(layout, options):
-        frame, pose = clicked_frame(scan, layout, pitch_um, options)
-        lines = _read(scan, layout, frame) if options.writing == "all" else None
-        shown = place_clicked_marks(
-            replace(present_frame(frame, pose, pitch_um, (), NO_REASON), writing=lines), options.clicks
-        )
-        contradiction = contradicted_pose(layout, options, pitch_um)
-        return _refused(shown, contradiction) if contradiction else shown
-    return place_clicked_marks(_search_frame(scan, layout, pitch_um, options), options.clicks)
-
-
-def _refused(frame: FrameMeasurement, why: Reason) -> FrameMeasurement:
-    """Reject all marks of the frame that are observations."""
+        damage = Reason(f"not found: {scan.damage}", Code.DAMAGED_FILE)
+        return FrameMeasurement(scan.name, _absent_marks(layout, damage))
+    clicked = clicked_frame(scan, layout, pitch_um, options) if options.clicks else None
+    if clicked is None:
+        return _place_clicked_marks(_search_frame(scan, layout, pitch_um, options), options.clicks)
+    frame, pose, contradiction = clicked
+    lines = _read(scan, layout, frame) if options.writing == "all" else None
+    shown = replace(present_frame(frame, pose, pitch_um, (), NO_REASON), writing=lines)
+    shown = _place_clicked_marks(shown, options.clicks)
+    if not contradiction:
+        return shown
     marks = (
-        replace(mark, status=Status.REJECTED, reason=why) if mark.status.is_observation else mark
-        for mark in frame.marks
+        replace(mark, status=Status.REJECTED, reason=contradiction) if mark.status.is_observation else mark
+        for mark in shown.marks
     )
-    return replace(frame, marks=tuple(marks), problems=(why.reword(f"{why}."), *frame.problems))
+    return replace(shown, marks=tuple(marks), problems=(contradiction.reword(f"{contradiction}."), *shown.problems))
 
 
 def _search_frame(
@@ -91,40 +104,34 @@ def _search_frame(
     """Search for the frame without clicks that give its place, and measure its marks."""
     found = find_frame(scan, layout, pitch_um, options)
     frame, result = found.frame, found.result
-    if frame is None:
-        absent = absent_frame(scan, layout, found.misfit, options.rotation_deg, pitch_um)
-        return replace(absent, writing=_read(scan, layout, None)) if options.writing == "all" else absent
-    is_faint = frame.is_faint
     lines = _read(scan, layout, frame) if options.writing == "all" else None
-    pose, against = ScanOrientation(options.pose, True, _SET), NO_REASON
+    if frame is None:
+        return replace(absent_frame(scan, layout, found.misfit, options.rotation_deg, pitch_um), writing=lines)
+    is_faint, own, against = frame.is_faint, frame.placement.pose, NO_REASON
+    pose = decide_pose(frame, lines or ())
     if options.pose == "auto":
-        pose = decide_pose(frame, lines or ())
         if options.writing == "pose" and not pose.decided and frame.accepted:
             lines = _read(scan, layout, frame, options.known_lines)
             pose = decide_pose(frame, lines or ())
-        frame, pose = _rename(frame, pose)
+        if pose.name != own:
+            renamed = rename_frame(frame, pose.name)
+            if renamed is frame:  # fewer marks agree under the new names: its own orientation is kept, only assumed
+                contrary = f"fewer marks agree in orientation {pose.name} than in {own}, which is assumed."
+                pose = replace(pose, name=own, decided=False, evidence=(*pose.evidence, contrary), rivals=())
+            frame = renamed
     else:
-        against = _against_the_set_pose(frame, lines or ())
+        if pose.name != own and frame.unblemished:
+            against = _against_the_set_pose(own, decide_pose(frame, lines or (), (own, pose.name)))
+        pose = ScanOrientation(options.pose, True, _SET)
     # A faint frame is not tested again: it was accepted only if significant.
     chance = NO_REASON if is_faint else doubt_frame(result, frame)
     problems = [each.reword(f"{each}.") for each in (*_rivals(result, frame), chance, against) if each]
-    doubts = problems if frame.measured_count else [_UNSURE, *problems]
+    doubts = problems if frame.unblemished else [_UNSURE, *problems]
     if doubts and options.pose == "auto":
         pose = replace(pose, decided=False, evidence=(*pose.evidence, *doubts))
     if frame.options.film_model != options.film_model:
         problems.append(_OBLIQUE)
     return replace(present_frame(frame, pose, pitch_um, problems, _FAINT if is_faint else chance), writing=lines)
-
-
-def _rename(frame: Frame, pose: ScanOrientation) -> tuple[Frame, ScanOrientation]:
-    """Rename the marks to those of a pose. If fewer of them agree then, keep the frame, its pose only assumed."""
-    if pose.name == frame.placement.pose:
-        return frame, pose
-    renamed = rename_frame(frame.scan, frame, pose.name)
-    if renamed is not frame:
-        return renamed, pose
-    against = f"fewer marks agree in orientation {pose.name} than in {frame.placement.pose}, which is assumed."
-    return frame, replace(pose, name=frame.placement.pose, decided=False, evidence=(*pose.evidence, against), rivals=())
 
 
 def _read(
@@ -137,7 +144,7 @@ def _read(
     if frame is None:
         return read_writing(scan, nets)
     matrix = frame.pixel_from_camera
-    frame_px = _corners_px(matrix, layout)
+    frame_px = frame_corners_px(matrix, layout)
     pixel_from_up = matrix[:, :2] @ UP_FROM_CAMERA[frame.placement.pose].T
     for known in known_lines:
         outline_px = np.array(known.outline_mm) @ pixel_from_up.T + matrix[:, 2]
@@ -147,12 +154,14 @@ def _read(
     return read_writing(scan, nets, frame_px)
 
 
-def _against_the_set_pose(frame: Frame, lines: Sequence[Line]) -> Reason:
+def frame_corners_px(pixel_from_camera: Array, layout: FiducialLayout) -> Array:
+    """(4, 2) corners of a frame, in order around it."""
+    corners_mm = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array(layout.frame_mm) / 2
+    return np.asarray(corners_mm @ pixel_from_camera[:, :2].T + pixel_from_camera[:, 2])
+
+
+def _against_the_set_pose(own: str, pose: ScanOrientation) -> Reason:
     """Warn if the image decides for another pose than the one set in the project; empty otherwise."""
-    own, likeliest = frame.placement.pose, decide_pose(frame, lines)
-    if likeliest.name == own or not frame.measured_count:
-        return NO_REASON
-    pose = decide_pose(frame, lines, (own, likeliest.name))
     if not pose.decided or pose.name == own:
         return NO_REASON
     evidence = " ".join(pose.evidence).rstrip(".")
@@ -165,10 +174,14 @@ def _against_the_set_pose(frame: Frame, lines: Sequence[Line]) -> Reason:
 
 def _rivals(result: SearchResult, frame: Frame) -> list[Reason]:
     """Warn of other placements in the same pose that are nearly as good, or that show another frame."""
-    problems, best = [], frame.placement
+    problems, best, fits = [], frame.placement, frame.inlier_fits
+    found_mm, found_px = frame.camera_mm[list(fits)], np.array([fit.center_px for fit in fits.values()]).reshape(-1, 2)
     for other in result.placements:
         is_rival = other.pose == best.pose and other.pitch_mm == best.pitch_mm and not other.same_place(best)
-        if not is_rival or _leads_to(other, frame):
+        if not is_rival:
+            continue
+        # It leads to this very frame if the marks found lie where they would be searched from it.
+        if fits and np.hypot(*(other.places_px(found_mm) - found_px).T).max() <= frame.first_search_px:
             continue
         as_good = other.score >= _AMBIGUOUS * best.score and (
             other.supported >= best.supported - 1 or _lacks_its_own(frame, other)
@@ -193,18 +206,10 @@ def _rivals(result: SearchResult, frame: Frame) -> list[Reason]:
     return problems[:3]
 
 
-def _leads_to(placement: Placement, frame: Frame) -> bool:
-    """Whether all marks found in a frame lie where they would be searched from a placement."""
-    fits = frame.inlier_fits
-    places = np.array([fit.center_px for fit in fits.values()]).reshape(-1, 2)
-    off_px = np.hypot(*(placement.places_px(frame.camera_mm[list(fits)]) - places).T)
-    return bool(fits) and bool(off_px.max() <= frame.first_search_px)
-
-
 def _lacks_its_own(frame: Frame, rival: Placement) -> bool:
     """Whether the marks that a frame has and a rival placement lacks are hardly found: in a lattice that is named one
     step off, the outermost line."""
-    found = np.array([fit is not None for fit in frame.fits])
+    found = np.array([index in frame.inlier_fits for index in range(len(frame.detections))])
     inside = np.array([detection.inside for detection in frame.detections])
     apart_px, _ = cKDTree(rival.places_px(frame.camera_mm)).query(frame.predicted_px)
     own = inside & (apart_px > frame.first_search_px)
@@ -221,64 +226,154 @@ def _is_another_frame(result: SearchResult, other: Placement, frame: Frame) -> b
     return frame_there.is_sure and not frame.contains(frame_there)
 
 
-def second_frame(scan: Scan, layout: FiducialLayout, frame: FrameMeasurement, options: FiducialOptions) -> Reason:
-    """Search the rest of the scan for a second frame.
+def _place_clicked_marks(frame: FrameMeasurement, clicks: Sequence[Click]) -> FrameMeasurement:
+    """Place clicked marks that could not be matched where the user clicked, with the standard deviation of a click."""
+    by_point, marks = {click.point: click for click in clicks}, []
+    for mark in frame.marks:
+        if mark.point in by_point and not mark.status.is_observation:
+            click = by_point[mark.point]
+            place = np.array([click.col_px, click.row_px])
+            covariance = Covariance({Cause.CLICK: CLICK_SIGMA_PX**2 * np.eye(2)})
+            sentence = f"it is where a person pointed, for nothing could be matched there: {mark.reason}"
+            reason = Reason(sentence, Code.CLICKED, *mark.reason.codes)
+            mark = replace(mark, center_px=place, covariance=covariance, status=Status.WEAK, reason=reason)
+        marks.append(mark)
+    return replace(frame, marks=tuple(marks))
 
-    Returns
-    -------
-    Reason
-        States the windows that name both frames in images.csv; empty if there is no room for a whole second frame, or
-        none is found.
+
+def absent_frame(
+    scan: Scan, layout: FiducialLayout, reason: Reason, rotation_deg: float, pitch_um: tuple[float, float] | None
+) -> FrameMeasurement:
+    """Return the result for a scan in which no frame was found.
+
+    Parameters
+    ----------
+    reason : why, as a clause.
+    rotation_deg : largest rotation of the search.
+    pitch_um : given pixel pitch in x and y, None if unknown.
     """
-    named = any(Code.OTHER_FRAME in problem.codes for problem in frame.problems)
-    if frame.pixel_from_camera is None or frame.px_per_mm is None or options.part or named:
-        return NO_REASON
-    first = _outline(frame, layout)
-    pitch_um = 1000.0 / frame.px_per_mm
-    alone = replace(options, clicks=(), writing="none", known_lines=())
-    for rest in _rests(scan, first):
-        lens = None if options.lens is None else options.lens.crop(*rest[:2])
-        found = measure_fiducials(crop_scan(scan, rest), layout, (pitch_um, pitch_um), replace(alone, lens=lens))
-        measured = sum(mark.status is Status.MEASURED for mark in found.marks)
-        if measured >= max(_FEWEST_MARKS, _MOST_MARKS * len(layout.marks)) and found.pixel_from_camera is not None:
-            second = _outline(found, layout) + np.array(rest[:2] * 2)
-            windows = f"{_words(scan, first)} and {_words(scan, second)}"
-            return Reason(
-                f"The scan shows a second frame, {measured} marks of it found, and only one was measured. List both in "
-                f"images.csv, with the scan's name and a suffix, and give the column window: {windows}.",
-                Code.SECOND_PICTURE,
-            )
-    return NO_REASON
+    also = "; parts of the scan's file are damaged" if scan.damage else ""
+    codes = dict.fromkeys((Code.NO_FRAME, *reason.codes, *([Code.DAMAGED_FILE] if scan.damage else [])))
+    marks = _absent_marks(layout, Reason(f"not found: {reason}{also}", *codes))
+    remedy = (
+        "check whether the camera is that of the scan, the pitch right, and the film laid within "
+        f"{rotation_deg:g} degrees of upright or of a quarter turn"
+    )
+    if all(mark.mark.polarity != "auto" for mark in layout.marks):
+        remedy += ', and the scan no negative of what the camera file draws (polarity = "auto" takes both)'
+    if Code.NO_FIT in reason.codes:
+        remedy = "compare the drawings of these marks with the scan, or set tone under [measure] in the project"
+    coarse, finest_um = NO_REASON, 1000 * min(finest_detail_mm(mark.mark) for mark in layout.marks)
+    if pitch_um and finest_um < _PLAIN_PX * max(pitch_um):
+        coarse = Reason(
+            f"The scan may be too coarse: at {max(pitch_um):.0f} µm a pixel the finest detail of the marks, "
+            f"{finest_um:.0f} µm, is {finest_um / max(pitch_um):.1f} px wide. "
+            f"Scan at {finest_um / _PLAIN_PX:.0f} µm or finer.",
+            Code.SMALL,
+        )
+    remedy += f". {coarse}" if coarse else "."
+    problem = Reason(f"no fiducial was measured: {reason}; {remedy}", Code.NO_FRAME, *coarse.codes)
+    return FrameMeasurement(scan.name, marks, None, None, (problem,))
 
 
-def _outline(frame: FrameMeasurement, layout: FiducialLayout) -> Array:
-    """(4,) bounding rectangle of a frame, px: first column, first row, last column, last row."""
-    assert frame.pixel_from_camera is not None
-    places = _corners_px(frame.pixel_from_camera, layout)
-    return np.concatenate([places.min(axis=0), places.max(axis=0)])
+def _absent_marks(layout: FiducialLayout, reason: Reason) -> tuple[MarkMeasurement, ...]:
+    return tuple(MarkMeasurement(mark.id, "fiducial", None, None, Status.ABSENT, reason) for mark in layout.marks)
 
 
-def _corners_px(pixel_from_camera: Array, layout: FiducialLayout) -> Array:
-    """(4, 2) corners of a frame, in order around it."""
-    corners_mm = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array(layout.frame_mm) / 2
-    return np.asarray(corners_mm @ pixel_from_camera[:, :2].T + pixel_from_camera[:, 2])
+def present_frame(
+    frame: Frame,
+    pose: ScanOrientation,
+    pitch_um: tuple[float, float] | None,
+    problems: Sequence[Reason],
+    chance: Reason,
+) -> FrameMeasurement:
+    """Return the result for a frame that was found.
+
+    Parameters
+    ----------
+    pitch_um : given pixel pitch in x and y; None: pixels are taken as square.
+    problems : sentences on why the frame may lie elsewhere, in addition to the problems that its marks show.
+    chance : why the frame may be a false alarm, or that its marks are faint; empty otherwise.
+
+    Notes
+    -----
+    Measured marks become weak if the frame may be a false alarm or is faint. If its names are ambiguous, or it is more
+    likely a false alarm than not, no mark is an observation.
+    """
+    if Code.NO_FRAME in chance.codes:
+        places = zip(frame.layout.marks, frame.detections, frame.predicted_px, strict=True)
+        marks = tuple(_unmeasured(mark.id, each, place, chance) for mark, each, place in places)
+        return FrameMeasurement(frame.scan.name, marks, pose, problems=tuple(problems), weights=frame.weights)
+    if is_nearest_neighbour(frame.scan):
+        detections = (each.amend(parts={Cause.INTERPOLATION: NEAREST_PX2}) for each in frame.detections)
+        frame, problems = replace(frame, detections=tuple(detections)), (*problems, _NEAREST)
+    unnamed = next((problem for problem in problems if Code.AMBIGUOUS in problem.codes), NO_REASON)
+    marks = tuple(_row(mark, index, frame, pose, chance, unnamed) for index, mark in enumerate(frame.layout.marks))
+    problems = (*problems, *_orientation_problems(frame, pitch_um))
+    tone = replace(frame.tone, tone=frame.tone.tone.without_priors)
+    notes = (frame.channel_note,) if frame.channel_note else ()
+    orientation = frame.pixel_from_camera
+    return FrameMeasurement(frame.scan.name, marks, pose, orientation, problems, frame.weights, tone, notes=notes)
 
 
-def _rests(scan: Scan, outline: Array) -> list[Window]:
-    """Windows to the left and right of a frame, above and below it, that have room for another one."""
-    col0, row0, col1, row1 = (int(value) for value in outline)
-    width, height = outline[2:] - outline[:2]
-    rests = [
-        (0, 0, col0, scan.height_px),
-        (col1, 0, scan.width_px - col1, scan.height_px),
-        (0, 0, scan.width_px, row0),
-        (0, row1, scan.width_px, scan.height_px - row1),
-    ]
-    return [rest for rest in rests if rest[2] >= _ROOM * width and rest[3] >= _ROOM * height]
+def _unmeasured(point: str, detection: Detection, place_px: Array, why: Reason) -> MarkMeasurement:
+    """Row of a mark without a measurement: predicted, or absent outside of the scan."""
+    if detection.inside:
+        return MarkMeasurement(point, "fiducial", place_px, None, Status.PREDICTED, why)
+    return MarkMeasurement(point, "fiducial", None, None, Status.ABSENT, detection.reason)
 
 
-def _words(scan: Scan, outline: Array) -> str:
-    """Window around a frame, in the notation of images.csv."""
-    low = np.maximum(np.floor(outline[:2]), 0).astype(int)
-    high = np.minimum(np.ceil(outline[2:]), (scan.width_px, scan.height_px)).astype(int)
-    return f'"{low[0]} {low[1]} {high[0] - low[0]} {high[1] - low[1]}"'
+def _orientation_problems(frame: Frame, pitch_um: tuple[float, float] | None) -> list[Reason]:
+    """Problems of the interior orientation: an implausible stretch, with the likely cause, or no redundancy."""
+    problems = []
+    per_mm = np.hypot(*frame.pixel_from_camera[:, :2].T)
+    expected = pitch_um or (1.0, 1.0)
+    if abs(per_mm[0] * expected[0] / (per_mm[1] * expected[1]) - 1) > 2 * AFFINITY_SIGMA:
+        wide_um, tall_um = 1000 / per_mm[0], 1000 / per_mm[1]
+        if pitch_um is None:
+            given, cause = "no pitch is given, so that pixels are taken as square", "pixels that are not square"
+        elif pitch_um == frame.scan.pitch_um:
+            given = f"the file's resolution tags say {pitch_um[0]:.1f} x {pitch_um[1]:.1f} µm"
+            cause = "wrong resolution tags"
+        else:
+            given, cause = f"{pitch_um[0]:.1f} x {pitch_um[1]:.1f} µm is given", "a wrong pitch"
+        problem = (
+            f"by the marks a pixel is {wide_um:.1f} µm wide and {tall_um:.1f} µm tall, but {given}: more than "
+            f"film deforms. The likely cause is {cause}: set pitch_um = [{wide_um:.2f}, {tall_um:.2f}] in the "
+            "project, or check scanner and camera file."
+        )
+        problems.append(Reason(problem, Code.PITCH))
+    used = int(frame.inliers.sum())
+    if used <= 3:
+        kind = "an affine transformation" if used == 3 else "a similarity"
+        problem = f"{kind} on {used} fiducials has no redundancy: no check. More marks give one: `reseau review`."
+        problems.append(Reason(problem, Code.NO_CHECK))
+    return problems
+
+
+def _row(
+    mark: LayoutMark, index: int, frame: Frame, pose: ScanOrientation, weak_reason: Reason, ambiguity: Reason
+) -> MarkMeasurement:
+    """Row of a mark. weak_reason: why no mark of the frame is measured; ambiguity: why none is an observation."""
+    detection = frame.detections[index]
+    fit = detection.fit
+    if fit is None:
+        return _unmeasured(mark.id, detection, detection.predicted_px, detection.reason)
+    names = "snr", "contrast_dn", "noise_dn", "blur_px", "damaged_fraction", "likeness", "significance"
+    quality = {name: float(getattr(fit, name)) for name in (*names, "redundancy", "neighbour_correlation")}
+    if fit.edges is not None:  # offset of the second method's place from the matched one, and in standard deviations
+        col, row = fit.edges.offset_px.tolist()
+        quality |= {"second_method_col_px": col, "second_method_row_px": row, "second_method_sigmas": fit.edges.sigmas}
+    status, reason = frame.verdict(index)
+    covariance, name = fit.place_covariance, frame.scan.name
+    if isinstance(mark.mark, MarkTemplate):
+        covariance = honest_covariance(mark.mark, name, fit)
+        if set(mark.mark.shares) == {name}:
+            weak_reason = _OWN
+        elif mark.mark.learned_mm and not pose.is_unambiguous_up_to(mark.mark.alike):
+            weak_reason = _ASSUMED  # under another name its origin lies elsewhere
+    if status is Status.MEASURED and weak_reason:
+        status, reason = Status.WEAK, weak_reason
+    if status.is_observation and ambiguity:
+        status, reason = Status.REJECTED, ambiguity
+    return MarkMeasurement(mark.id, "fiducial", fit.center_px, covariance, status, reason, {**quality, **fit.figures})

@@ -57,10 +57,6 @@ class BelievedFilm:
     model: str = "affine"
     lens: TakingLens | None = None
 
-    @property
-    def added_later_mm(self) -> float:
-        return self.sigma_mm if self.is_stated else 0.0
-
 
 ANY_FILM = BelievedFilm()
 

@@ -26,7 +26,6 @@ from measure.marks.shapes import (
     LEARNED_ORIGIN,
     Disk,
     FiducialLayout,
-    LayoutMark,
     Mark,
     MarkShape,
     MarkTemplate,
@@ -166,20 +165,18 @@ def _name_sites(frame: Frame, pose: str, fits: Sequence[MarkFit], missed: Array)
     if len(fits) < 2:
         return hypothesis
     own = names[: len(fits)][found]
-    given = np.array([_given_sigma_mm(frame.layout.marks[name]) for name in own])
+    given = []
+    for mark in (frame.layout.marks[name] for name in own):
+        # The origin of a learned mark differs from name to name.
+        origin_mm = LEARNED_ORIGIN * mark.mark.learned_mm if isinstance(mark.mark, MarkTemplate) else 0.0
+        given.append(float(np.hypot(min(max(mark.sigma_mm), _FREE_MM), origin_mm)))
     measured = np.array([fit.sigma_px for fit in fits])[found] * pitch.mean()
-    sigma = np.sqrt(given**2 + measured**2 + options.film_sigma_mm**2)
+    sigma = np.sqrt(np.array(given) ** 2 + measured**2 + options.film_sigma_mm**2)
     up = frame.up_mm(centers[: len(fits)][found])
     fit = fit_frame(frame.camera_mm[own], up, sigma, UP_FROM_CAMERA[pose], options.film_model)
     degrees = SCATTER_DEGREES + max(fit.redundancy, 0)
     coordinates = -degrees / 2 * float(np.log1p(fit.chi_square / SCATTER_DEGREES))
     return replace(hypothesis, coordinates=coordinates, chi_square=fit.chi_square)
-
-
-def _given_sigma_mm(mark: LayoutMark) -> float:
-    """Standard deviation of a given place, including that of a learned mark's origin: it differs from name to name."""
-    origin_mm = LEARNED_ORIGIN * mark.mark.learned_mm if isinstance(mark.mark, MarkTemplate) else 0.0
-    return float(np.hypot(min(max(mark.sigma_mm), _FREE_MM), origin_mm))
 
 
 def _decision(
@@ -239,40 +236,33 @@ def _against(best: _Hypothesis, rival: _Hypothesis, layout: FiducialLayout, line
             f"{rival.pose} with log-odds {abs(best.coordinates - rival.coordinates):.1f}."
         )
     if abs(best.writing - rival.writing) > TOLD:
-        sentences.append(_writing_sentence(best, rival, layout, lines))
+        lead = best.writing - rival.writing
+        by_line = [
+            (line_score(line, layout.writing, best.pose) - line_score(line, layout.writing, rival.pose)) * np.sign(lead)
+            for line in lines
+        ]
+        telling = [index for index in np.argsort(-np.array(by_line), kind="stable").tolist() if by_line[index] > 0]
+        quoted = ", ".join(f'"{lines[index].text}"' for index in telling[:_QUOTED])
+        word = "against" if lead > 0 else "for"
+        sentences.append(
+            f"the writing, such as {quoted}, is evidence {word} orientation {rival.pose} with log-odds {abs(lead):.1f}."
+        )
     return tuple(sentences)
-
-
-def _writing_sentence(best: _Hypothesis, rival: _Hypothesis, layout: FiducialLayout, lines: Sequence[Line]) -> str:
-    """Sentence with the evidence of the writing on two orientations, quoting the most significant lines."""
-    lead = best.writing - rival.writing
-    by_line = [
-        (line_score(line, layout.writing, best.pose) - line_score(line, layout.writing, rival.pose)) * np.sign(lead)
-        for line in lines
-    ]
-    telling = [index for index in np.argsort(-np.array(by_line), kind="stable").tolist() if by_line[index] > 0]
-    quoted = ", ".join(f'"{lines[index].text}"' for index in telling[:_QUOTED])
-    word = "against" if lead > 0 else "for"
-    return f"the writing, such as {quoted}, is evidence {word} orientation {rival.pose} with log-odds {abs(lead):.1f}."
 
 
 def _difference(one: int, other: int, layout: FiducialLayout) -> str:
     """Feature that distinguishes two marks of the camera."""
     if one < 0 or other < 0:
         return "marks where the other orientation has none"
-    (core, dots), (other_core, other_dots) = (_figure(layout.marks[index].mark) for index in (one, other))
-    if core != other_core:
+    figures: list[tuple[object, int]] = []  # irrespective of the rotation, without identification dots; their number
+    for mark in (layout.marks[index].mark for index in (one, other)):
+        parts = mark.parts if isinstance(mark, MarkShape) else ()
+        dots = [part for part in parts if isinstance(part, Disk) and part.center_mm != (0.0, 0.0)]
+        rest = sorted(type(part).__name__ for part in parts if part not in dots)
+        figures.append((rest if isinstance(mark, MarkShape) else mark, len(dots)))
+    if figures[0][0] != figures[1][0]:
         return "different marks"
-    return "identification dots" if dots != other_dots else "the marks' directions"
-
-
-def _figure(mark: Mark) -> tuple[object, int]:
-    """Figure of a mark irrespective of its rotation, and number of its identification dots."""
-    if not isinstance(mark, MarkShape):
-        return mark, 0
-    dots = [part for part in mark.parts if isinstance(part, Disk) and part.center_mm != (0.0, 0.0)]
-    rest = [part for part in mark.parts if part not in dots]
-    return sorted(type(part).__name__ for part in rest), len(dots)
+    return "identification dots" if figures[0] != figures[1] else "the marks' directions"
 
 
 def writing_likelihoods(lines: Sequence[Line], places: Sequence[WrittenPlace], poses: Sequence[str]) -> Array:
@@ -299,13 +289,9 @@ def line_score(line: Line, places: Sequence[WrittenPlace], pose: str) -> float:
     side = side_in_camera(line.side, pose)
     there = [max(upright.values()) if place.pose is None else upright.get(place.pose, 0.0)
              for place in expected if place.side == side]  # fmt: skip
-    return max([anyhow - _place_odds(line), *(_A_CHARACTER * legible for legible in there)])
-
-
-def _place_odds(line: Line) -> float:
-    """Log-odds that a line lies where the camera writes."""
-    other = _A_WORD if any(character.isalpha() for character in line.text) else _A_NUMBER
-    return max(_A_FIELD * signs(line), other)
+    # Log-odds that it lies where the camera writes.
+    odds = max(_A_FIELD * signs(line), _A_WORD if any(each.isalpha() for each in line.text) else _A_NUMBER)
+    return max([anyhow - odds, *(_A_CHARACTER * legible for legible in there)])
 
 
 def side_in_camera(side: Side, pose: str) -> Side:
@@ -458,7 +444,10 @@ class MarkSite:
             return np.zeros(len(shown))
         window = self._window(len(views[0].grey))
         views = [self._placed(window, view, spare) for view in views]
-        area = _area([view.grey for view in views])
+        # Pixels on and around all drawings; no mark explains the image farther off.
+        greys = [view.grey for view in views]
+        outside = (np.max(greys, axis=0) - np.min(greys, axis=0).clip(max=0.0) < _ALIKE).astype(np.uint8)
+        area: Mask = np.asarray(cv2.distanceTransform(outside, cv2.DIST_L2, 5) <= _ABOUT_PX)
         residuals = [self._residuals(window, view.grey, area & view.known) for view in views]
         # Large residuals of even the best image are not noise, and reduce the significance of the differences.
         noise_dn = self.like.noise_dn / self.drawings.reduction
@@ -527,21 +516,14 @@ def _draw_view(mark: Mark, grid_from_mark: Array, blur_px: float) -> View:
     half = int(np.ceil(np.abs(extent_px(mark, place)).max() + 2 * _ABOUT_PX))
     place[:, 2] = half
     size = 2 * half + 1
-    known = covered = np.ones((size, size), dtype=bool)
+    known, covered, noise = np.ones((size, size), dtype=bool), np.ones((size, size), dtype=bool), 0.0
     if isinstance(mark, MarkTemplate):
         known = chip_mask(mark, place, size, size)
         covered = chip_mask(replace(mark, steady=None), place, size, size)
-    return View(picture(mark, place, size, size, blur_px, ROUGH_CELLS), known, covered, _noise(mark))
-
-
-def _noise(mark: Mark) -> float:
-    """Standard deviation of a chip's pixels, fraction of its contrast; inf where unknown, 0 for a drawn mark."""
-    if not isinstance(mark, MarkTemplate):
-        return 0.0
-    if mark.noise_dn == 0.0:
-        return np.inf
-    of_mean = float(np.sqrt(sum(share**2 for share in mark.shares.values())))
-    return mark.noise_dn * of_mean / max(float(np.ptp(mark.image)), 1e-9)
+        # As a fraction of the contrast; of a mean of several scans, each with its share.
+        of_mean = float(np.sqrt(sum(share**2 for share in mark.shares.values())))
+        noise = mark.noise_dn * of_mean / max(float(np.ptp(mark.image)), 1e-9) if mark.noise_dn else np.inf
+    return View(picture(mark, place, size, size, blur_px, ROUGH_CELLS), known, covered, noise)
 
 
 def _distinct(views: Sequence[View]) -> tuple[list[View], list[int]]:
@@ -562,9 +544,3 @@ def _excess(misfits: Array, areas: Mask) -> Array:
     best = int(((misfits * areas).sum(axis=(1, 2)) / counts).argmin())
     excess = ((misfits - misfits[best]) * (areas & areas[best])).sum(axis=(1, 2))
     return np.asarray(excess - excess.min())
-
-
-def _area(pictures: Sequence[Array]) -> Mask:
-    """Mask of the pixels on and around all drawings; no mark explains the image farther off."""
-    outside = (np.max(pictures, axis=0) - np.min(pictures, axis=0).clip(max=0.0) < _ALIKE).astype(np.uint8)
-    return np.asarray(cv2.distanceTransform(outside, cv2.DIST_L2, 5) <= _ABOUT_PX)

@@ -2,14 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import groupby
+from itertools import compress, groupby
 from operator import attrgetter
 
 import numpy as np
 
 from measure.detection.correlation import WIDE, Surroundings
 from measure.detection.responses import Effort, MarkView, Responses, correlate_scan, correlate_windows
-from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, lattice_steps_mm, mark_signs
+from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, lattice_steps_mm, mark_sign
 from measure.fiducials.options import FiducialOptions
 from measure.geometry import POSES, UP_FROM_CAMERA
 from measure.marks.shapes import FiducialLayout
@@ -18,7 +18,6 @@ from measure.scans.scan import Scan
 Pair = tuple[float, float]
 
 _PITCH_STRETCHES = (-0.015, 0.015, -0.03, 0.03)  # relative: an office scanner's carriage may be some per cent too fast
-_SLIGHT = (-0.005, 0.005, -0.01, 0.01)  # relative stretches for faint marks, searched within narrow bounds only
 _SCALE_STEPS = (1.1, 1.0, 0.91, 0.83, 0.75)  # of the largest scale at which the frame fits into the scan
 _STEP_TOLERANCE = 0.06  # relative tolerance of each scale step: it reaches the next step
 _LARGE_PX = 1 << 24  # px in a large scan; smaller ones are read whole in a short time
@@ -76,12 +75,6 @@ def pitch_hypotheses(
     return [*as_given, filling] if fills else [*as_given, filling, filling_longer]
 
 
-def slightly_longer(given: PitchHypothesis, tolerance: float) -> tuple[Hypotheses, Hypotheses]:
-    """Return the given pitch, and variants with slightly non-square pixels, each with a tolerance."""
-    near = replace(given, tolerance=tolerance)
-    return [near], [longer(near, stretch) for stretch in _SLIGHT]
-
-
 def longer(given: PitchHypothesis, stretch: float) -> PitchHypothesis:
     """Stretch the pixels: longer across than down by a relative amount, or shorter if it is negative."""
     x, y = given.mm
@@ -95,12 +88,6 @@ def longer(given: PitchHypothesis, stretch: float) -> PitchHypothesis:
 def reach_mm(layout: FiducialLayout) -> float:
     """Search radius around the place of a mark in a centred frame."""
     return _REACH * max(layout.frame_mm)
-
-
-def room_mm(scan: Scan, layout: FiducialLayout, pitch_mm: tuple[float, float]) -> float:
-    """Largest distance between the centre of the scan and that of a frame wholly inside it."""
-    scan_mm = scan.width_px * pitch_mm[0], scan.height_px * pitch_mm[1]
-    return max((max(scan_mm) - min(layout.frame_mm)) / 2, 0.0) + _BEYOND_MM
 
 
 def is_searched_by_windows(scan: Scan, layout: FiducialLayout, pitch_mm: tuple[float, float]) -> bool:
@@ -156,7 +143,7 @@ class FrameSearch:
         self.scan, self.layout, self._effort = scan, layout, effort or Effort()
         self._poses = POSES if options.pose == "auto" else (options.pose,)
         self._camera_mm = np.array([mark.xy_mm for mark in layout.marks])
-        self._signs = mark_signs(layout.marks)
+        self._signs = {mark_sign(mark.mark, assumed) for mark in layout.marks for assumed in (1, -1)}
         self._cache = self._effort.make_cache(scan)
         self._last: tuple[tuple[Pair, Surroundings], Responses] | None = None
 
@@ -180,21 +167,21 @@ class FrameSearch:
         Each mark is searched only in the window that this leaves, if all windows together are clearly smaller than the
         scan.
         """
+        scan_px, span_mm = np.array([self.scan.width_px, self.scan.height_px]), float(np.abs(self._camera_mm).max())
         result = SearchResult()
         for drawn_mm, alike in groupby(hypotheses, attrgetter("drawn_mm")):
             own = list(alike)
-            room = room_mm(self.scan, self.layout, drawn_mm) + self._slack_mm(options, own)
+            # Distance between the centres of scan and frame, and of a mark from its place in the frame, by a rotation
+            # and a wrong or non-square pitch.
+            room = max((float((scan_px * drawn_mm).max()) - min(self.layout.frame_mm)) / 2, 0.0) + _BEYOND_MM
+            scale = max(each.tolerance + float(np.abs(np.divide(each.mm, drawn_mm) - 1).max()) for each in own)
+            turn = float(np.deg2rad(options.rotation_deg))
+            room += (scale + turn) * span_mm + options.search_mm(self.layout)
             window_px = float(np.prod(2 * room / np.asarray(drawn_mm)))
             is_wide = len(self.layout.marks) * window_px > _WINDOWS_SHARE * self.scan.width_px * self.scan.height_px
             responses = self._scan_responses(drawn_mm, WIDE) if is_wide else self._middle_responses(drawn_mm, room)
             result = result.join(self._placements(options, own, responses))
         return result
-
-    def _slack_mm(self, options: FiducialOptions, hypotheses: Hypotheses) -> float:
-        """Largest shift of a mark, relative to the frame's centre, by a rotation and a wrong or non-square pitch."""
-        scale = max(each.tolerance + float(np.abs(np.divide(each.mm, each.drawn_mm) - 1).max()) for each in hypotheses)
-        turn = float(np.deg2rad(options.rotation_deg))
-        return (scale + turn) * float(np.abs(self._camera_mm).max()) + options.search_mm(self.layout)
 
     def _scan_responses(self, drawn_mm: Pair, surroundings: Surroundings) -> Responses:
         """Responses in the whole scan; the last ones are kept for the next attempt."""
@@ -234,12 +221,12 @@ class FrameSearch:
         for number, pose in enumerate(self._poses):
             for search in searches.values():
                 search.search_pose(pose, responses.kinds[number * len(marks) : (number + 1) * len(marks)])
-        every = (each for search in searches.values() for own in search.placements.values() for each in own)
-        found = tuple(each for each in every if not options.part or self._shows_middle(each))
-        return SearchResult(found, searches, (self.scan.width_px, self.scan.height_px))
-
-    def _shows_middle(self, placement: Placement) -> bool:
-        """Whether the frame contains the centre of a scan of its part: two marks also fit frames beside the scan."""
-        linear, shift = placement.pixel_from_camera[:, :2], placement.pixel_from_camera[:, 2]
-        middle_mm = np.linalg.solve(linear, np.array([self.scan.width_px, self.scan.height_px]) / 2 - shift)
-        return bool((np.abs(middle_mm) < np.array(self.layout.frame_mm) / 2).all())
+        found = [each for search in searches.values() for own in search.placements.values() for each in own]
+        size_px = self.scan.width_px, self.scan.height_px
+        if options.part:  # it shows its scan's centre in the frame: two marks also fit frames beside the scan
+            matrices, middle_px = [each.pixel_from_camera for each in found], np.array(size_px) / 2
+            middles_mm = [np.linalg.solve(matrix[:, :2], middle_px - matrix[:, 2]) for matrix in matrices]
+            frame_mm = np.array(self.layout.frame_mm)
+            within = [bool((np.abs(middle_mm) < frame_mm / 2).all()) for middle_mm in middles_mm]
+            found = list(compress(found, within))
+        return SearchResult(tuple(found), searches, size_px)

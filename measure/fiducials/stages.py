@@ -3,20 +3,35 @@
 One loop makes the stages in order and skips those that an earlier result makes unnecessary. One criterion accepts a
 frame: the expected number of false frames in all stages so far, or in those under the given pitch alone, whose prior
 probability is above that of all others together.
+
+A dot on a rough background resembles many specks, a cross in a ring nothing else: no single threshold fits both. The
+false-alarm rate of one mark is therefore the share of other places that correlate at least as strongly as the weakest
+mark found: all places of the reduced scan, or places beside the marks at full resolution.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from typing import Literal
 
 import numpy as np
+from scipy.special import bdtrc, comb
 
+from measure.array_types import Array
 from measure.detection.correlation import CLOSE, GRAINY, WIDE, Surroundings
-from measure.fiducials.constellation import Placement, distinct_places
-from measure.fiducials.frame import Frame
+from measure.fiducials.constellation import NARROW, Placement, distinct_places
+from measure.fiducials.frame import (
+    CHECKED,
+    FITTED_PX,
+    RANDOM_PLACES,
+    REDUCED_PX,
+    Frame,
+    measure_frame,
+    random_matches,
+    rename_frame,
+    shows_marks,
+)
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA
-from measure.fiducials.measure_frame import measure_frame, rename_frame, shows_marks
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import (
@@ -24,11 +39,18 @@ from measure.fiducials.search import (
     Hypotheses,
     SearchResult,
     is_searched_by_windows,
+    longer,
     pitch_hypotheses,
-    slightly_longer,
 )
-from measure.fiducials.significance import doubt_frame, false_frames, false_placements
-from measure.flags import MAX_FALSE_FRAMES, MAX_FALSE_PLACEMENTS, Code, Reason
+from measure.flags import (
+    FRAME_DOUBT_P,
+    FRAME_REJECTED_P,
+    MAX_FALSE_FRAMES,
+    MAX_FALSE_PLACEMENTS,
+    NO_REASON,
+    Code,
+    Reason,
+)
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
 from measure.tone.curve import Tone
@@ -44,7 +66,15 @@ _NOTHING = Reason("no two of the camera's marks were found in the scan", Code.NO
 _GAINED = 3  # marks: one more than the two additional parameters of a perspective may fit by chance
 _LACKED = 0.3  # fraction of the marks that an affine transformation misses if a perspective makes it miss any
 _OBLIQUE = 6  # marks needed to prove a perspective: any four fit one, and two more check it
+_SLIGHT = (-0.005, 0.005, -0.01, 0.01)  # relative stretches for faint marks, searched within narrow bounds only
 _STRETCH = 3 * AFFINITY_SIGMA  # relative error of a given pitch, where marks are too faint to correct it
+_CRITERIA = 3  # by which a false frame may be as good: response heights, misfit, and misfit under a stretch
+_STRETCHES = np.linspace(-0.03, 0.03, 13)  # relative, of non-square pixels; a step moves marks within narrow bounds
+_SELDOM, _HOPELESS = 1e-3, 1e6  # expected false frames between which full resolution may change the decision
+_COUNTED = 3  # marks at most to whose false-alarm rates the share at full resolution applies
+_APART = 2.0  # in search radii: beyond the response of a mark itself
+_FREE = 2  # marks that a similarity fits wherever they lie
+_SURE = 12  # inliers from which the frame is no false alarm: specks do not agree so often
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +112,8 @@ class Stage:
         if self.kind == "faint":
             return found.is_taken
         if self.kind == "given":
-            return found.frame is not None and found.frame.is_complete
+            best = found.frame  # taken or not: every mark is a clear inlier
+            return best is not None and best.accepted and len(best.clear_fits) == len(best.inliers) >= CHECKED
         if self.kind == "oblique":
             # Weak marks do not count as missing: a perspective displaces marks, but leaves their quality unchanged.
             return frame is not None and frame.inside - len(frame.inlier_fits) < max(_GAINED, _LACKED * frame.inside)
@@ -117,7 +148,10 @@ def list_stages(
 ) -> list[Stage]:
     """List the stages in order. pitch_um: given by the user or the file, None if unknown."""
     given, *others = pitch_hypotheses(scan, layout, pitch_um, options)
-    near, nearly = ([], given) if pitch_um is None else slightly_longer(given[0], _STRETCH)
+    near, nearly = [], given
+    if pitch_um is not None:
+        near = [replace(given[0], tolerance=_STRETCH)]
+        nearly = [longer(near[0], stretch) for stretch in _SLIGHT]
     is_given = pitch_um is not None and not options.part
     in_windows = is_given and is_searched_by_windows(scan, layout, given[0].mm)
     may_be_oblique = options.film_model == "affine" and len(layout.marks) >= _OBLIQUE
@@ -150,7 +184,10 @@ def find_frame(
         if stage.tone is None:
             hypotheses_so_far += len(stage.hypotheses)
             hypotheses_at_given_pitch += len(stage.hypotheses) if stage.is_given or stage.at_given else 0
-            result = search_stage(search, stage)
+            if stage.kind == "middle":
+                result = search.search_middle(stage.options, stage.hypotheses)
+            else:
+                result = search.search_scan(stage.options, stage.hypotheses, stage.surroundings)
         tried = hypotheses_at_given_pitch if stage.at_given else hypotheses_so_far
         start = scan if stage.tone is None else scan.replace_tone(stage.tone)
         frames = measure_stage(start, layout, stage, result, tried)
@@ -158,26 +195,24 @@ def find_frame(
         if expected <= MAX_FALSE_FRAMES:
             found = replace(found, result=result, frame=frame, is_taken=True)
         elif stage.is_given:
-            if stage.tone is None or (frame is not None and frame.is_nearer_than(found.frame)):
+            # Under another tone curve it has to be nearer to acceptance: more inliers, then more clear ones.
+            own, before = (
+                (len(each.inlier_fits), len(each.clear_fits)) if each else (-1, -1) for each in (frame, found.frame)
+            )
+            if stage.tone is None or own > before:
                 misfit = explain_misfit(frame) if frame else _NOTHING
                 found = replace(found, result=result, frame=frame, is_taken=False, misfit=misfit)
         else:
             share = hypotheses_at_given_pitch / tried
-            likely = [] if stage.at_given else [each for each in frames if _is_accepted_at_given_pitch(each, share)]
+            # Those that would be accepted if their pitch were given.
+            likely = [each for each in frames if each[1].accepted or each[0] * share <= MAX_FALSE_FRAMES]
+            likely = [] if stage.at_given else likely
             rejected = [each for each in (found.faint, *frames) if each and each not in likely]
             unsure = (*found.unsure, *(frame for _, frame in likely))
             found = replace(found, unsure=unsure, faint=min(rejected, key=itemgetter(0), default=None))
     if found.is_taken:
         return found
-    what_to_do = _pitch_to_try(found.unsure) or _too_faint(found.faint)
-    return replace(found, frame=None, misfit=found.misfit.reword(found.misfit + what_to_do))
-
-
-def search_stage(search: FrameSearch, stage: Stage) -> SearchResult:
-    """Find the placements of a stage."""
-    if stage.kind == "middle":
-        return search.search_middle(stage.options, stage.hypotheses)
-    return search.search_scan(stage.options, stage.hypotheses, stage.surroundings)
+    return replace(found, frame=None, misfit=found.misfit.reword(found.misfit + _what_to_do(found)))
 
 
 def measure_stage(
@@ -191,7 +226,9 @@ def measure_stage(
     Placements under another tone curve or pitch are measured only if some marks are clear there.
     """
     kind, options, found = stage.kind, stage.options, result.placements
-    places = _places_to_try(found[:1] if kind in ("middle", "oblique") else found)
+    # The best placement, then others elsewhere by score times supporting marks: a few high peaks alone are often false.
+    others = [] if kind in ("middle", "oblique") else sorted(found[1:], key=lambda each: -each.score * each.supported)
+    places = distinct_places((*found[:1], *others), _TRIALS + 1)
     if kind in ("pitch", "faint"):
         number = tried if kind == "faint" else len(stage.hypotheses)
         places = [each for each in places if number * false_placements(result, each) <= MAX_FALSE_PLACEMENTS]
@@ -206,7 +243,7 @@ def measure_stage(
         return [] if frame is None else [(0.0 if frame.accepted else np.inf, frame)]
     if kind == "oblique":
         frames = (frame for frame in measured if frame.accepted)
-        frames = (frame for frame in frames if frame.measured_count >= max(least[0], frame.inside - least[1]))
+        frames = (frame for frame in frames if len(frame.unblemished) >= max(least[0], frame.inside - least[1]))
         evaluated = [(tried * false_frames(result, frame, frame.unblemished), frame) for frame in frames]
     else:
         evaluated = [each for frame in measured if (each := _evaluate(frame, result, tried))]
@@ -224,7 +261,7 @@ def best_frame(measured: Iterable[Frame], most_supported: int, result: SearchRes
     for frame in measured:
         if any(before.accepted and before.contains(frame) for before in frames):
             continue
-        if frame.is_sure and not (most_supported > frame.measured_count and doubt_frame(result, frame)):
+        if frame.is_sure and not (most_supported > len(frame.unblemished) and doubt_frame(result, frame)):
             return frame
         frames.append(frame)
     return max(frames, key=_preference, default=None)
@@ -233,7 +270,7 @@ def best_frame(measured: Iterable[Frame], most_supported: int, result: SearchRes
 def _preference(frame: Frame) -> tuple[int, ...]:
     """Order of frames that may be doubted: sure ones, accepted ones, those that another tone curve may cure."""
     if frame.is_sure:
-        return 2, frame.measured_count
+        return 2, len(frame.unblemished)
     return (1, 0) if frame.accepted else (0, bool(frame.failed_fits), int(frame.inliers.sum()))
 
 
@@ -242,7 +279,7 @@ def _evaluate(frame: Frame, result: SearchResult, tried: int) -> Evaluated | Non
     placement, frames = frame.placement, [frame]
     if frame.options.pose == "auto" and frame.inliers.any():
         pose = decide_pose(frame).name
-        frames += [] if pose == placement.pose else [rename_frame(frame.scan, frame, pose)]
+        frames += [] if pose == placement.pose else [rename_frame(frame, pose)]
     frames = [each for each in frames if each.agrees]
     if not frames:
         return None
@@ -250,17 +287,6 @@ def _evaluate(frame: Frame, result: SearchResult, tried: int) -> Evaluated | Non
     as_measured = min(false_frames(result, each, each.inlier_fits) for each in frames)
     most = max(frames, key=lambda each: each.inliers.sum())
     return 2 * tried * min(as_measured, false_placements(result, placement)), most
-
-
-def _is_accepted_at_given_pitch(evaluated: Evaluated, share: float) -> bool:
-    """Whether a frame would be accepted if its pitch were given. share: of the hypotheses under the given pitch."""
-    return evaluated[1].accepted or evaluated[0] * share <= MAX_FALSE_FRAMES
-
-
-def _places_to_try(found: Sequence[Placement]) -> list[Placement]:
-    """Best placement, then others elsewhere by score times supporting marks: a few high peaks alone are often false."""
-    others = sorted(found[1:], key=lambda placement: -placement.score * placement.supported)
-    return distinct_places((*found[:1], *others), _TRIALS + 1)
 
 
 def explain_misfit(frame: Frame) -> Reason:
@@ -277,40 +303,163 @@ def explain_misfit(frame: Frame) -> Reason:
         return Reason(
             f"only {found}, and the fit of {names} did not converge, with whatever tone curve it began", Code.NO_FIT
         )
-    return Reason(f"the constellation does not fit: only {found}{_marks_outside(frame)}", Code.NO_FRAME)
+    pairs = zip(frame.layout.marks, frame.detections, strict=True)
+    outside = [mark.id for mark, detection in pairs if Code.OUTSIDE in detection.reason.codes]
+    if outside and frame.inliers.sum() >= 2:
+        found += (
+            f", and these put {', '.join(outside)} outside of the scan: scan the whole frame, or say by part_of in "
+            "images.csv that this scan is a part of it"
+        )
+    return Reason(f"the constellation does not fit: only {found}", Code.NO_FRAME)
 
 
-def _marks_outside(frame: Frame) -> str:
-    """Clause on marks predicted outside the scan; empty if there are none."""
-    outside = [
-        mark.id
-        for mark, detection in zip(frame.layout.marks, frame.detections, strict=True)
-        if Code.OUTSIDE in detection.reason.codes
-    ]
-    if not outside or frame.inliers.sum() < 2:
+def _what_to_do(found: Found) -> str:
+    """Clause on the best of the possible false alarms, with the pitch to try, or on a rejected frame with less than one
+    expected false alarm; empty without either."""
+    if found.unsure:
+        best = max(found.unsure, key=lambda frame: (len(frame.unblemished), int(frame.inliers.sum())))
+        pair = ", ".join(f"{um:.2f}" for um in 1000 / np.hypot(*best.pixel_from_camera[:, :2].T))
+        agreeing = f"under another pitch {int(best.inliers.sum())} of them fit, which may be a false alarm"
+        return f"; {agreeing}: try pitch_um = [{pair}]"
+    expected, frame = found.faint or (np.inf, None)
+    if frame is None or expected >= 1:
         return ""
-    return (
-        f", and these put {', '.join(outside)} outside of the scan: scan the whole frame, or say by part_of in "
-        "images.csv that this scan is a part of it"
-    )
-
-
-def _pitch_to_try(unsure: Sequence[Frame]) -> str:
-    """Clause on the best of the possible false alarms, with the pitch to try; empty without one."""
-    if not unsure:
-        return ""
-    best = max(unsure, key=lambda frame: (frame.measured_count, int(frame.inliers.sum())))
-    pair = ", ".join(f"{um:.2f}" for um in 1000 / np.hypot(*best.pixel_from_camera[:, :2].T))
-    agreeing = f"under another pitch {int(best.inliers.sum())} of them fit, which may be a false alarm"
-    return f"; {agreeing}: try pitch_um = [{pair}]"
-
-
-def _too_faint(likeliest: Evaluated | None) -> str:
-    """Clause on a rejected frame with less than one expected false alarm; empty otherwise."""
-    if likeliest is None or likeliest[0] >= 1:
-        return ""
-    expected, frame = likeliest
     return (
         f"; {int(frame.inliers.sum())} faint marks fit, where {expected:.1g} such false alarms are expected: another "
         "pitch does not separate them; click the visible marks in `reseau review`"
+    )
+
+
+def false_placements(result: SearchResult, placement: Placement) -> float:
+    """Expected number of placements as good in a similar scan without any frame, under this pitch hypothesis alone."""
+    search = result.searches[placement.pitch_mm]
+    places = placement.places_px(search.camera_mm)
+    inside = np.all((places >= 0) & (places < result.size_px), axis=1)
+    found = {index: places[index] for index in np.flatnonzero(inside).tolist()}
+    return _false_alarms(result, placement, found, len(found), search.tolerance_px)
+
+
+def false_frames(result: SearchResult, frame: Frame, indices: Iterable[int]) -> float:
+    """Expected number of false frames as good in the scan as one with marks, by index, found where they were fitted.
+
+    Null hypothesis: detections are uniform within the search tolerance. A good fit of many marks by a similarity, with
+    or without a stretch, is then improbable. Many places respond as strongly at reduced resolution, but few of them at
+    full resolution: the number is multiplied by their share to the power of at most `_COUNTED` marks.
+    """
+    placement, found_px = frame.placement, {index: frame.inlier_fits[index].center_px for index in indices}
+    widest_px, expected = result.searches[placement.pitch_mm].tolerance_px, list[float]()
+    for stretches in (np.zeros(1), _STRETCHES):
+        misfit_px = _misfit_px(frame, found_px, stretches)
+        tolerance_px = min(max(misfit_px, NARROW * widest_px), widest_px)
+        expected.append(len(stretches) * _false_alarms(result, placement, found_px, frame.inside, tolerance_px))
+    reduced = _CRITERIA * min(expected)
+    if placement.reduction == 1 or not _SELDOM < reduced < _HOPELESS:
+        return reduced
+    return reduced * _share_at_full_resolution(result, frame, found_px) ** min(_COUNTED, len(found_px))
+
+
+def _share_at_full_resolution(result: SearchResult, frame: Frame, found_px: Mapping[int, Array]) -> float:
+    """Share of the places with responses as strong at reduced resolution that also have them at full resolution."""
+    marks_px, apart_px = np.array([*found_px.values()]), _APART * frame.first_search_px
+    search = result.searches[frame.placement.pitch_mm]
+    others = list[tuple[int, Array]]()
+    for index, own in found_px.items():
+        responses, key = search.responses, search.key(frame.placement, index)
+        height = responses.dilated(key, search.tolerance_px).height(responses.reduced_px(own))
+        candidates = responses.candidates(key)
+        as_good = responses.scan_px(candidates[responses.highest_about(key, candidates, 0.0)[1] >= height])
+        compared = as_good[: RANDOM_PLACES // len(found_px)]
+        others += [(index, place) for place in compared if np.hypot(*(marks_px - place).T).min() > apart_px]
+    weakest = min(frame.response(index, place, FITTED_PX) for index, place in found_px.items())
+    radius_px = REDUCED_PX * frame.placement.reduction
+    return _share(sum(frame.response(index, place, radius_px) >= weakest for index, place in others), len(others))
+
+
+def _share(hits: int, places: int) -> float:
+    """Share by Laplace's rule of succession: no hit among sixty places does not mean a rate of zero."""
+    return (hits + 1) / (places + 2)
+
+
+def _misfit_px(frame: Frame, found_px: Mapping[int, Array], stretches: Array) -> float:
+    """Largest residual, px of the reduced scan, of the marks found after a similarity with the best stretch."""
+    if not found_px:
+        return 0.0
+    placement, pitch = frame.placement, frame.pitch_mm
+    given = frame.camera_mm[list(found_px)] @ placement.pixel_from_camera[:, :2].T
+    found = np.array([*found_px.values()])
+    found = found if placement.lens is None else placement.lens.ideal_px(found)
+    given, found = ((each - each.mean(axis=0)) * pitch for each in (given, found))
+    longer = np.stack([1 + stretches / 2, 1 - stretches / 2], axis=-1)
+    given, found = (given * longer[:, None]) @ (1, 1j), found @ (1, 1j)
+    turns = (given.conj() @ found) / np.maximum((np.abs(given) ** 2).sum(axis=1), 1e-12)
+    off = np.abs(found - turns[:, None] * given).max(axis=1)
+    return float(off.min() / pitch.mean() / placement.reduction)
+
+
+def _false_alarms(
+    result: SearchResult, placement: Placement, found_px: Mapping[int, Array], inside: int, tolerance_px: float
+) -> float:
+    """Expected number of false frames, from the shares of places that respond as strongly within tolerance_px.
+
+    Of n marks in the scan k respond, the weakest at least as strongly as a share p of all places. A random frame has as
+    many with a probability of about (n over k) p^k. The number of distinct frames is that of all pairs of places, for
+    two marks far apart, that the bounds of rotation and scale allow.
+    """
+    search = result.searches[placement.pitch_mm]
+    responses, shares, same_px = search.responses, [], 1
+    for index, place in found_px.items():
+        dilation = responses.dilated(search.key(placement, index), tolerance_px)
+        shares.append(dilation.share(responses.reduced_px(place)))
+        same_px = dilation.area_px
+    counts = np.arange(max(min(3, inside), 1), len(shares) + 1)
+    if len(counts) == 0:
+        return np.inf
+    likely = comb(inside, counts) * np.sort(shares)[counts - 1] ** counts
+    # Number of distinct frames: same_px neighbouring places of the reduced scan have the same dilated response.
+    extent_mm = float(np.hypot(*np.ptp(search.camera_mm, axis=0)))
+    span_px = extent_mm / float(search.pitch.mean()) / responses.reduction
+    places = next(iter(responses.maps.values())).size
+    second = 2 * search.bounds.rotation_rad * 2 * search.bounds.scale_tolerance * span_px**2
+    polarities = len({sign for _, sign in responses.maps})
+    different = places / same_px * second / same_px * len(search.distinct) * polarities
+    return float(len(counts) * likely.min() * different)
+
+
+def doubt_frame(result: SearchResult, frame: Frame) -> Reason:
+    """Test whether a frame may be a false alarm.
+
+    If some marks were not found, by the correlation beside the marks (binomial): two marks fit any similarity, and a
+    frame in doubt needs more that no random place matches. Otherwise by the expected number of false frames.
+
+    Returns
+    -------
+    Reason
+        Empty if the frame is significant. Contains the code no-frame if it is likely a false alarm.
+    """
+    if len(frame.inlier_fits) >= _SURE:
+        return NO_REASON
+    inside = frame.inside
+    # A mark searched only where the others predict it is no independent evidence.
+    clear = [index for index in frame.clear_fits if not frame.detections[index].closer]
+    if len(clear) < inside:
+        matches, places = random_matches(frame, clear)
+        hits = max(matches.values(), default=places)
+        chance = float(bdtrc(len(clear) - _FREE - 1, inside - _FREE, _share(hits, places)))
+        if chance <= FRAME_DOUBT_P:
+            return NO_REASON
+        unmatched = sum(each == 0 for each in matches.values())
+        return Reason(
+            f"only {len(clear)} of {inside} marks were found, and {hits} of {places} random places match "
+            f"as well (p = {chance:.2f}): the frame may lie elsewhere",
+            *((Code.CHANCE, Code.NO_FRAME) if chance > FRAME_REJECTED_P or unmatched < frame.least else (Code.CHANCE,)),
+        )
+    if len(clear) <= _FREE or not result.is_exhaustive(frame.placement):
+        return NO_REASON
+    expected = false_frames(result, frame, clear)
+    if expected <= FRAME_DOUBT_P:
+        return NO_REASON
+    return Reason(
+        f"so many places of the scan match the {len(clear)} marks found that {expected:.2g} such false alarms are "
+        "expected in it; the frame may lie elsewhere",
+        Code.CHANCE,
     )

@@ -346,7 +346,7 @@ def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Tri
     finest_mm = min(finest_detail_mm(mark.mark) for mark in each.layout.marks)
     if frame and (width_px := linear_scale(frame.pixel_from_camera) * finest_mm) < _LEAST_DETAIL_PX:
         frame, reason = None, f"too coarse: the finest detail of its marks would be {width_px:.2f} px wide there"
-    fits = [fit for fit in frame.fits if fit] if frame else []
+    fits = list(frame.inlier_fits.values()) if frame else []
     residual = _residual(frame, each.layout) if frame else None
     score, chance = likeness(frame) if frame else 0.0, None
     if score > close and expected > MAX_FALSE_CAMERAS:
@@ -373,7 +373,7 @@ def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Tri
 
 def _residual(frame: Frame, layout: FiducialLayout) -> tuple[float, float] | None:
     """Residuals per axis of an affine transformation, in standard deviations and mm; None without redundancy."""
-    pairs = [(fit, given) for fit, given in zip(frame.fits, layout.marks, strict=True) if fit]
+    pairs = [(fit, layout.marks[index]) for index, fit in frame.inlier_fits.items()]
     redundancy = 2 * len(pairs) - _AFFINE
     if redundancy <= 0:
         return None

@@ -12,8 +12,8 @@ import numpy as np
 
 from measure.annotations.text import MISSING, networks
 from measure.errors import MeasurementError, MissingError, TooLargeError, UnreachableError
-from measure.fiducials.measurement import measure_fiducials, second_frame
-from measure.fiducials.rows import pitch_problem, with_damage
+from measure.fiducials.measurement import measure_fiducials
+from measure.fiducials.scan_checks import pitch_problem, second_frame, with_damage
 from measure.flags import Code, Reason, Status
 from measure.marks.rendering import extent_px
 from measure.results import FrameMeasurement, MarkMeasurement, moved_frame

@@ -14,20 +14,18 @@ from measure.detection.responses import ByteCache, Responses
 from measure.fiducials import consistency, stages
 from measure.fiducials.across_frames import check_frames
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, same_picture
-from measure.fiducials.frame import Frame
+from measure.fiducials.frame import Frame, fit_lines_and_sharpening, measure_frame
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA, fit_frame
-from measure.fiducials.measure_frame import fit_lines_and_sharpening, measure_frame
-from measure.fiducials.measurement import _lacks_its_own
-from measure.fiducials.rows import pitch_problem, present_frame
+from measure.fiducials.measurement import _lacks_its_own, present_frame
+from measure.fiducials.scan_checks import pitch_problem
 from measure.fiducials.scan_orientation import SPOILT, MarkSite, PosedMark, decide_pose
-from measure.fiducials.search import PitchHypothesis, SearchResult
-from measure.fiducials.significance import doubt_frame
-from measure.fiducials.stages import Found, Kind, Stage, find_frame
+from measure.fiducials.search import FrameSearch, PitchHypothesis, SearchResult
+from measure.fiducials.stages import Found, Kind, Stage, doubt_frame, find_frame
 from measure.flags import MAX_FALSE_FRAMES, NO_REASON, Code, Reason
 from measure.geometry import POSES, UP_FROM_CAMERA
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross, dot
 from measure.marks.templates import cut, learn_template
-from measure.results import FrameMeasurement, ScanOrientation
+from measure.results import FrameMeasurement, MarkFit, ScanOrientation
 from measure.tone.curve import Tone
 from measure.tone.sharpening import Sharpening
 
@@ -467,7 +465,7 @@ def test_a_lattice_named_one_step_off_lacks_the_line_that_it_alone_has(monkeypat
     for placement, lacks in ((off, True), (right, False)):
         frame = Frame.from_placement(make_scan(np.zeros((500, 500))), layout, placement, FiducialOptions())
         is_shown = [place[0] < 415.0 for place in frame.predicted_px]
-        monkeypatch.setattr(Frame, "fits", [object() if shown else None for shown in is_shown])
+        monkeypatch.setattr(Frame, "inlier_fits", dict.fromkeys(np.flatnonzero(is_shown).tolist(), object()))
         frame = replace(frame, detections=tuple(replace(each, inside=True) for each in frame.detections))
         assert _lacks_its_own(frame, right if placement is off else off) == lacks
 
@@ -510,13 +508,13 @@ class Stand:
     """What an attempt finds, in a frame's stead."""
 
     def __init__(self, name: str) -> None:
-        self.name, self.is_complete, self.accepted, self.measured_count = name, False, False, 0
+        self.name, self.accepted = name, False
         self.is_sure, self.agrees, self.is_faint, self.scan = False, False, False, SCAN
         self.failed_fits: list[int] = []
+        self.unblemished: list[int] = []
+        self.inlier_fits: dict[int, MarkFit] = {}
+        self.clear_fits = self.inlier_fits
         self.inliers, self.pixel_from_camera = np.ones(3, bool), np.eye(2, 3)
-
-    def is_nearer_than(self, other: "Stand | None") -> bool:
-        return other is None
 
 
 def search_attempts(
@@ -540,7 +538,7 @@ def search_attempts(
         return [] if each is None else [(tried * each, cast(Frame, Stand(str(number))))]
 
     monkeypatch.setattr(stages, "list_stages", lambda *_: made)
-    monkeypatch.setattr(stages, "search_stage", lambda *_: SearchResult())
+    monkeypatch.setattr(FrameSearch, "search_scan", lambda *_: SearchResult())
     monkeypatch.setattr(stages, "measure_stage", measure)
     monkeypatch.setattr(stages, "doubt_frame", lambda *_: NO_REASON)
     monkeypatch.setattr(stages, "explain_misfit", lambda stand: Reason(f"not {stand.name}"))

@@ -12,10 +12,9 @@ from true_marks import KIND, TrueMark, some_mark
 from measure import FiducialLayout, FiducialOptions, LayoutMark, MarkShape, Status, cross
 from measure.fiducials import mark_comparison
 from measure.fiducials.constellation import Placement
-from measure.fiducials.frame import Frame
+from measure.fiducials.frame import Frame, choose_fit, compare_shapes, detect_frame, measure_frame, orient_frame
 from measure.fiducials.mark_fit import not_found
-from measure.fiducials.measure_frame import choose_fit, detect_frame, measure_frame, orient_frame
-from measure.fiducials.rows import absent_frame
+from measure.fiducials.measurement import absent_frame
 from measure.fiducials.stages import explain_misfit
 from measure.flags import NO_REASON, Cause
 from measure.marks.shapes import polygon
@@ -73,7 +72,7 @@ def test_crosses_whose_lines_are_narrower_than_drawn_are_drawn_so_and_fitted() -
     drawn_mm = {round(mark.mark.thinnest_mm, 3) for mark in frame.layout.marks}
     assert len(drawn_mm) == 1
     assert min(drawn_mm) < 0.11
-    for fit, mark in zip(frame.fits, given.marks, strict=True):
+    for fit, mark in zip(frame.inlier_fits.values(), given.marks, strict=True):
         assert np.hypot(*(center(fit) - matrix @ (*mark.xy_mm, 1.0))) < 0.05
 
 
@@ -215,7 +214,7 @@ KNOWN = Covariance.from_noise(0.2**2 * np.eye(2))
     ],
 )
 def test_the_verdict_on_a_mark(plain: Frame, own: dict[str, Any], others: dict[str, Any], status: Status) -> None:
-    fits = {k: replace(fit, **(others if k else own)) for k, fit in enumerate(plain.fits) if fit is not None}
+    fits = {k: replace(fit, **(others if k else own)) for k, fit in plain.inlier_fits.items()}
     assert plain.replace_fits(fits).verdict(0)[0] is status
 
 
@@ -224,7 +223,7 @@ def test_a_size_that_edges_leave_open_is_a_finite_figure(plain: Frame) -> None:
     layout = replace(plain.layout, marks=tuple(replace(mark, mark=wedge) for mark in plain.layout.marks))
     shapes = {n: OwnShape(np.array([5e4 * n, 0.0]), open_size, np.zeros((2, 2))) for n in plain.inlier_fits}
     fits = {n: replace(fit, own_shape=shapes[n]) for n, fit in plain.inlier_fits.items()}
-    compared = mark_comparison.compare_shapes(replace(plain, layout=layout).replace_fits(fits))
+    compared = compare_shapes(replace(plain, layout=layout).replace_fits(fits))
     ratios = [fit.figures["size_ratio"] for fit in compared.inlier_fits.values()]
     assert len(ratios) == len(fits)
     assert np.isfinite(ratios).all()
@@ -284,5 +283,5 @@ def test_wings_of_three_marks_under_wrong_names_claim_no_more_than_the_stretch_t
     scan = make_scan(grey)
     placement = Placement("0", np.column_stack([linear, middle]), 8.0, 3, 1, 1, (1 / PX_PER_MM, 1 / PX_PER_MM))
     frame = measure_frame(scan, FiducialLayout(layout, (50.0, 50.0)), placement, FiducialOptions())
-    for fit, place in zip(frame.fits, true_px, strict=True):
+    for fit, place in zip(frame.inlier_fits.values(), true_px, strict=True):
         assert chi_square(fit, place) < 16.0

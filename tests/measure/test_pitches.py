@@ -16,12 +16,11 @@ from small_scene import hidden_field
 from studies import parametrize_with_studies
 
 from measure import FiducialOptions, FrameMeasurement, Scan, Status, measure_fiducials, open_scan
-from measure.fiducials.measure_frame import best_weights, registered_channels
-from measure.fiducials.measurement import second_frame
+from measure.fiducials.channel_weights import best_weights, registered_channels
 from measure.fiducials.options import CLICK_SIGMA_PX, Click
-from measure.fiducials.rows import pitch_problem
+from measure.fiducials.scan_checks import pitch_problem, second_frame
 from measure.fiducials.search import FrameSearch, PitchHypothesis, is_lattice
-from measure.fiducials.significance import false_placements
+from measure.fiducials.stages import false_placements
 from measure.flags import Cause, Code, Reason
 from measure.geometry import POSES
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, ring_cross

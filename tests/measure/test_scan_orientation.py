@@ -16,7 +16,7 @@ from studies import parametrize_with_studies
 
 from measure import FrameMeasurement, MatchOptions, ScanWindow, Status, match, measure_fiducials
 from measure.annotations.lines import KnownLine, Line, Reading, read_from_one_face
-from measure.fiducials.measure_frame import measure_frame, rename_frame
+from measure.fiducials.frame import measure_frame, rename_frame
 from measure.fiducials.options import FiducialOptions, Reads
 from measure.fiducials.scan_orientation import Drawings, MarkSite, PosedMark, side_in_camera, writing_likelihoods
 from measure.fiducials.search import FrameSearch, pitch_hypotheses
@@ -239,11 +239,11 @@ def test_a_frame_viewed_as_its_mirror_image_is_renamed_as_it_lies() -> None:
     right = next(each for each in found.placements if each.pose == "0")
     mirrored = measure_frame(scan, LEANING, right.posed("0m", right_mm(LEANING)), OPTIONS)
     assert int(mirrored.inliers.sum()) < 4
-    frame = rename_frame(scan, mirrored, "0")
+    frame = rename_frame(mirrored, "0")
     assert frame.inliers.all()
     assert len(frame.clear_fits) == 4
     # It is not replaced by one with fewer marks.
-    assert rename_frame(scan, frame, "0m") is frame
+    assert rename_frame(frame, "0m") is frame
 
 
 def right_mm(layout: shapes.FiducialLayout) -> Array:
