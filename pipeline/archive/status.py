@@ -89,7 +89,7 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
             if judging is not None:
                 judging.check()
             for *row, is_whole in store.connection.execute(_QUERY, (-1 if judging is None else judging.row,)):
-                if not is_whole:
+                if not is_whole:  # a damaged row counts as a failure
                     row[6:] = [str(Verdict.FAILED), _DAMAGED, str(FailureCode.DAMAGED), None, "", row[11], None]
                 rows[row[0]] = row
             idle = inapplicable(judging)
