@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from importlib.resources.abc import Traversable
 from typing import get_args
 
 import cv2
@@ -76,25 +75,16 @@ class Networks:
 @cache
 def networks() -> Networks | None:
     """Load the networks once per process; None where they are missing."""
-    files = _files()
-    if not files:
-        return None
-    detection, recognition = (file.read_bytes() for file in files)
-    return Networks(_net(detection), _net(recognition), _characters(recognition))
-
-
-def _files() -> tuple[Traversable, ...]:
-    """Files of both networks, none if one is missing. The package is not imported, since it needs another runtime."""
-    spec = importlib.util.find_spec(PACKAGE)
+    spec = importlib.util.find_spec(PACKAGE)  # not imported, since it needs another runtime
     if spec is None:
-        return ()
+        return None
     models = resources.files(importlib.util.module_from_spec(spec)) / "models"
     files = (models / _DETECTION, models / _RECOGNITION)
-    return files if all(file.is_file() for file in files) else ()
-
-
-def _net(model: bytes) -> cv2.dnn.Net:
-    return cv2.dnn.readNetFromONNX(np.frombuffer(model, np.uint8))
+    if not all(file.is_file() for file in files):
+        return None
+    contents = [file.read_bytes() for file in files]
+    detection, recognition = (cv2.dnn.readNetFromONNX(np.frombuffer(content, np.uint8)) for content in contents)
+    return Networks(detection, recognition, _characters(contents[1]))
 
 
 def _characters(model: bytes) -> tuple[str, ...]:
@@ -134,30 +124,23 @@ class Place:
 
 
 def find_writing(picture: Bytes, networks: Networks) -> list[Place]:
-    """Detect the lines of text in an image (rows, columns), in arbitrary order."""
-    probability = _probability(picture, networks)
+    """Detect the lines of text in an image (rows, columns), in arbitrary order. The probability of text of each pixel
+    is computed in parts that lie beside one another."""
+    parts = []
+    for start in range(0, picture.shape[1], _PART_PX):
+        first = max(start - _CONTEXT_PX, 0)
+        part = picture[:, first : start + _PART_PX + _CONTEXT_PX]
+        height, width = part.shape
+        below, right = -height % _MULTIPLE_PX, -width % _MULTIPLE_PX
+        padded = cv2.copyMakeBorder(part, 0, below, 0, right, cv2.BORDER_REPLICATE)
+        networks.detection.setInput(_input(np.asarray(padded, np.uint8)))
+        found = np.asarray(networks.detection.forward()[0, 0, :height, :width], np.float32)
+        parts.append(found[:, start - first :][:, :_PART_PX].copy())
+    probability = np.concatenate(parts, axis=1)
     written = (probability > _WRITTEN).astype(np.uint8)
     contours, _ = cv2.findContours(written, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
     places = (_place(np.asarray(contour), probability) for contour in contours)
     return [place for place in places if place is not None]
-
-
-def _probability(picture: Bytes, networks: Networks) -> NDArray[np.float32]:
-    """Probability of text for each pixel, computed in parts that lie beside one another."""
-    parts, width = [], picture.shape[1]
-    for start in range(0, width, _PART_PX):
-        first = max(start - _CONTEXT_PX, 0)
-        part = _part_probability(picture[:, first : start + _PART_PX + _CONTEXT_PX], networks)
-        parts.append(part[:, start - first :][:, :_PART_PX].copy())
-    return np.concatenate(parts, axis=1)
-
-
-def _part_probability(picture: Bytes, networks: Networks) -> NDArray[np.float32]:
-    height, width = picture.shape
-    below, right = -height % _MULTIPLE_PX, -width % _MULTIPLE_PX
-    padded = cv2.copyMakeBorder(picture, 0, below, 0, right, cv2.BORDER_REPLICATE)
-    networks.detection.setInput(_input(np.asarray(padded, np.uint8)))
-    return np.asarray(networks.detection.forward()[0, 0, :height, :width], np.float32)
 
 
 def _place(contour: NDArray[np.int32], probability: NDArray[np.float32]) -> Place | None:
@@ -167,29 +150,26 @@ def _place(contour: NDArray[np.int32], probability: NDArray[np.float32]) -> Plac
     if length < height:
         length, height, angle = height, length, angle + 90.0
     tilt = (angle + 90.0) % 180.0 - 90.0
-    if height < _LEAST_PX or abs(tilt) > _TILT_DEG or _mean_probability(contour, probability) < _SURE:
+    if height < _LEAST_PX or abs(tilt) > _TILT_DEG:
+        return None
+    col, row, wide, tall = cv2.boundingRect(contour)
+    inside = np.zeros((tall, wide), np.uint8)
+    cv2.drawContours(inside, [contour], -1, 1, -1, offset=(-col, -row))
+    if float(probability[row : row + tall, col : col + wide][inside > 0].mean()) < _SURE:
         return None
     grown = _UNSHRUNK * length * height / (length + height)
     place = Place((float(center[0]), float(center[1])), length + grown, height + grown, tilt)
     return place if place.length_px >= _LONG * place.height_px else None
 
 
-def _mean_probability(contour: NDArray[np.int32], probability: NDArray[np.float32]) -> float:
-    col, row, width, height = cv2.boundingRect(contour)
-    inside = np.zeros((height, width), np.uint8)
-    cv2.drawContours(inside, [contour], -1, 1, -1, offset=(-col, -row))
-    return float(probability[row : row + height, col : col + width][inside > 0].mean())
-
-
 def read_ways(line: Bytes, networks: Networks) -> Mapping[str, Reading]:
     """Read the image of a line (HEIGHT_PX, width) in all four orientations: upright, upside down, mirrored, both."""
-    ways = (line, line[::-1, ::-1], line[:, ::-1], line[::-1])  # one by one, which takes a quarter of the memory
-    return {way: _read(turned, networks) for way, turned in zip(WAYS, ways, strict=True)}
-
-
-def _read(picture: Bytes, networks: Networks) -> Reading:
-    networks.recognition.setInput(_input(picture))
-    return _decoded(np.asarray(networks.recognition.forward()[0]), networks.characters)
+    readings = dict[str, Reading]()
+    turned = (line, line[::-1, ::-1], line[:, ::-1], line[::-1])
+    for way, picture in zip(WAYS, turned, strict=True):  # one by one, which takes a quarter of the memory
+        networks.recognition.setInput(_input(picture))
+        readings[way] = _decoded(np.asarray(networks.recognition.forward()[0]), networks.characters)
+    return readings
 
 
 def _input(picture: Bytes) -> NDArray[np.float32]:
@@ -265,21 +245,14 @@ class _Strip:
             for place in (each.scaled(reduction) for each in find_writing(np.asarray(small, np.uint8), networks)):
                 if any(other.covers(place) or place.covers(other) for other in known):
                     continue
-                line = self._line(place, networks)
-                if line.legible >= _LEAST_LEGIBLE:
-                    lines.append(line)
-                    known += [place] if line.confidence >= _READ_WELL else []
+                ways = {self.poses[way]: reading for way, reading in read_ways(self._cut(place), networks).items()}
+                pose, reading = max(ways.items(), key=lambda item: item[1].legible)
+                if reading.legible >= _LEAST_LEGIBLE:
+                    outline = place.outline_px() @ self.scan_from_strip[:, :2].T + self.scan_from_strip[:, 2]
+                    corners = tuple((float(col), float(row)) for col, row in outline)
+                    lines.append(Line(ways, pose, corners, self.side))
+                    known += [place] if reading.confidence >= _READ_WELL else []
         return lines
-
-    def _line(self, place: Place, networks: Networks) -> Line:
-        ways = {self.poses[way]: reading for way, reading in read_ways(self._cut(place), networks).items()}
-        outline = place.outline_px() @ self.scan_from_strip[:, :2].T + self.scan_from_strip[:, 2]
-        return Line(
-            ways=ways,
-            pose=max(ways, key=lambda pose: ways[pose].legible),
-            outline_px=tuple((float(col), float(row)) for col, row in outline),
-            side=self.side,
-        )
 
     def _cut(self, place: Place) -> Bytes:
         """Rectified image of a line (HEIGHT_PX, width)."""
@@ -307,7 +280,9 @@ def _strip(scan: Scan, side: Side, frame_px: Array | None, outline_px: Array | N
     width, height = (last - first).tolist()
     if min(width, height) < _LEAST_STRIP_PX:
         return None
-    grey = _to_8_bits(scan.reduced_window(factor, int(first[0]), int(first[1]), width, height))
+    reduced = scan.reduced_window(factor, int(first[0]), int(first[1]), width, height)
+    black, white = np.percentile(reduced[::2, ::2], (_BLACK, _WHITE))
+    grey = (255 * (reduced - black) / max(white - black, 1e-9)).clip(0, 255).astype(np.uint8)
     turn = side in ("left", "right")  # rotated clockwise by a quarter turn: its columns run upward in the scan
     linear = factor * (np.array([[0.0, 1.0], [-1.0, 0.0]]) if turn else np.eye(2))
     start = factor * (first + ((0, height - 1) if turn else (0, 0))) + (factor - 1) / 2
@@ -338,8 +313,3 @@ def _side_range(scan: Scan, side: Side, frame_px: Array | None) -> tuple[Array, 
     else:
         low[axis] = inner_high[axis]
     return low, high, longer_px
-
-
-def _to_8_bits(grey: NDArray[np.float32]) -> Bytes:
-    black, white = np.percentile(grey[::2, ::2], (_BLACK, _WHITE))
-    return np.ascontiguousarray((255 * (grey - black) / max(white - black, 1e-9)).clip(0, 255), np.uint8)

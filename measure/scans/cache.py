@@ -121,44 +121,34 @@ class SegmentCache:
         height, width, _ = samples.shape
         rows = range(row0 // tall, (row0 + height - 1) // tall + 1)
         cols = range(col0 // wide, (col0 + width - 1) // wide + 1)
-
-        def take(i: int, j: int, decoded: Samples) -> None:
-            row, col = i * tall - row0, j * wide - col0
-            part = decoded[max(-row, 0) : height - row, max(-col, 0) : width - col]
-            row, col = max(row, 0), max(col, 0)
-            samples[row : row + part.shape[0], col : col + part.shape[1]] = part
-
-        wanted = {key: self._segment(key) for key in product(rows, cols)}
+        with self._lock:
+            wanted = {key: self._kept.setdefault(key, _Segment()) for key in product(rows, cols)}
+            for key in wanted:
+                self._kept.move_to_end(key)
         others = [key for key, segment in wanted.items() if segment.samples is None and segment.lock.locked()]
         own = [key for key, segment in wanted.items() if segment.samples is None and not segment.lock.locked()]
         stored = self._segments.fetch(own)
         for key in sorted(wanted, key=others.__contains__):
-            take(*key, self._decode(key, wanted[key], stored.get(key, ())))
+            decoded = self._decode(key, wanted[key], stored.get(key, ()))
+            row, col = key[0] * tall - row0, key[1] * wide - col0
+            part = decoded[max(-row, 0) : height - row, max(-col, 0) : width - col]
+            row, col = max(row, 0), max(col, 0)
+            samples[row : row + part.shape[0], col : col + part.shape[1]] = part
 
-    def _segment(self, key: Place) -> _Segment:
-        """Segment by row and column of the grid."""
-        with self._lock:
-            segment = self._kept.setdefault(key, _Segment())
-            self._kept.move_to_end(key)
-        return segment
-
-    def _decode(self, key: Place, segment: _Segment, stored: Sequence[bytes] = ()) -> Samples:
-        """Decode a segment unless another thread has begun to."""
+    def _decode(self, key: Place, segment: _Segment, stored: Sequence[bytes]) -> Samples:
+        """Decode a segment unless another thread has begun to, and drop the least recently used ones to make room."""
         with segment.lock:
             samples = segment.samples
             if samples is None:
                 samples = segment.samples = self._segments.read(*key, stored)
-                self._make_room(samples.nbytes)
+                with self._lock:
+                    self._held += samples.nbytes
+                    while self._held > self._limit:
+                        kept = ((key, one.samples) for key, one in self._kept.items() if one.samples is not None)
+                        oldest, dropped = next(kept)
+                        self._held -= dropped.nbytes
+                        del self._kept[oldest]
         return samples
-
-    def _make_room(self, added: int) -> None:
-        """Drop the least recently used segments to make room for added bytes."""
-        with self._lock:
-            self._held += added
-            while self._held > self._limit:
-                oldest, samples = next((key, own.samples) for key, own in self._kept.items() if own.samples is not None)
-                self._held -= samples.nbytes
-                del self._kept[oldest]
 
 
 class WholePicture(Segments):
@@ -166,11 +156,7 @@ class WholePicture(Segments):
     a part of a sentence; empty if it can."""
 
     def __init__(
-        self,
-        samples: Samples,
-        rounding_step_dn: float = 0.0,
-        damage: str = "",
-        full_scale_dn: float | None = None,
+        self, samples: Samples, rounding_step_dn: float = 0.0, damage: str = "", full_scale_dn: float | None = None
     ) -> None:
         """full_scale_dn: None if all bits of a sample are used."""
         self._samples, self._damage, self.rounding_step_dn = samples, damage, rounding_step_dn

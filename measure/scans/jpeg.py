@@ -46,16 +46,15 @@ from measure.scans.metadata import (
     MOST_CHANNELS,
     NO_TAGS,
     Pitch,
-    Samples,
     check_size,
     damage_error,
+    exif_number,
     exif_tags,
     grey_or_colour,
     orientation_notes,
     orientation_tag,
     pitch_from_density,
     tag_pitch,
-    taking_camera,
 )
 from measure.tone.declared import ColourTags
 
@@ -66,7 +65,6 @@ _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # markers of frame 
 _HUFFMAN_FRAMES = (0xC0, 0xC1, 0xC2)  # sequential and progressive: others than lossless and arithmetic ones
 _END = b"\xff\xd9"
 _SCAN_OR_RESTART = re.compile(rb"\xff[\xda\xd0-\xd7]")  # markers: behind such a byte 255 a scan's data have a byte 0
-_MORE = "its stream holds more blocks than the picture"
 _OF_DAMAGE = ("Corrupt JPEG data", "Premature end")  # how libjpeg's warnings of it begin
 _BLEED_PX = 2  # that the decoder's interpolation of colour takes from the blocks beside
 _BELOW = 2  # rows of blocks added: a picture of one block a row has further ones below its first, too
@@ -74,6 +72,8 @@ _TAIL = bytes(range(64, 192)) * 2  # codes of some blocks, none of them a marker
 _DQT = 0xDB
 UNKNOWN_DN = 15.0  # where a file does not say it: as at quality 50, which no scan should be below
 _INKS = 4  # components
+_EXPOSURE = ("FocalLength", "FNumber", "ExposureTime", "ISOSpeedRatings")  # Exif tags of a digital camera
+_LONGEST_NAME = 60
 _COARSE = 15  # coefficients in the order of the table: up to two periods in a block of 8 px, as blurred edges have them
 
 BLOCK_PX = 8  # a side of a block (ITU-T T.81)
@@ -103,11 +103,6 @@ class _Blocks:
         """Of pixels, in whole units."""
         return -(-self.height_px // self.unit_height_px) * self.unit_height_px
 
-    @property
-    def interpolates_rows(self) -> bool:
-        """Whether rows of colour are fewer than those of the picture."""
-        return self.unit_height_px > BLOCK_PX
-
     def taller(self, data: bytes) -> bytes:
         """A stream of a picture with further rows of blocks."""
         height_px = self.rows + _BELOW * self.unit_height_px
@@ -122,18 +117,17 @@ def decode_checked(data: bytes, decode: Decode, tables: bytes | None = None) -> 
     if blocks is None:
         return decode(data), ""
     taller = decode(blocks.taller(data))
-    why = "" if _has_one_end(data) else _libjpeg_warning(data, tables)
-    if not why and _has_more_blocks(taller, blocks):
-        why = _MORE
-    elif not why and _has_one_end(data) and _ends_early(data, blocks, taller, decode):
-        why = "its stream ends before the picture does"
-    return decode(data) if blocks.interpolates_rows else taller[: blocks.height_px], why
-
-
-def _has_one_end(data: bytes) -> bool:
-    """Whether it is of one scan, without restart markers."""
     start = _header_bytes(data)
-    return len(_SCAN_OR_RESTART.findall(data, start, data.find(_END, start))) == 1
+    has_one_end = len(_SCAN_OR_RESTART.findall(data, start, data.find(_END, start))) == 1
+    why = "" if has_one_end else _libjpeg_warning(data, tables)
+    below = taller[blocks.rows + _BLEED_PX :] != blocks.grey
+    has_more = below[:, blocks.unit_width_px + _BLEED_PX :].any() or below[blocks.unit_height_px :].any()
+    if not why and has_more:
+        why = "its stream holds more blocks than the picture"
+    elif not why and has_one_end and _ends_early(data, blocks, taller, decode):
+        why = "its stream ends before the picture does"
+    # Where rows of colour are fewer than those of the picture, the decoder interpolates the last ones otherwise.
+    return decode(data) if blocks.unit_height_px > BLOCK_PX else taller[: blocks.height_px], why
 
 
 def _libjpeg_warning(data: bytes, tables: bytes | None) -> str:
@@ -170,12 +164,6 @@ def _blocks(data: bytes) -> _Blocks | None:
             return _Blocks(position + 5, height, width, BLOCK_PX * down, BLOCK_PX * across, 2 ** (body[0] - 1))
         position += 4 + len(body)
     return None
-
-
-def _has_more_blocks(taller: NDArray[np.generic], blocks: _Blocks) -> bool:
-    """Whether there are further blocks below the picture than the first."""
-    below = taller[blocks.rows + _BLEED_PX :] != blocks.grey
-    return bool(below[:, blocks.unit_width_px + _BLEED_PX :].any() or below[blocks.unit_height_px :].any())
 
 
 def _ends_early(data: bytes, blocks: _Blocks, taller: NDArray[np.generic], decode: Decode) -> bool:
@@ -225,36 +213,30 @@ def rounding_step_dn(data: bytes) -> float:
     return UNKNOWN_DN
 
 
-def open_jpeg(path: Path, max_pixels: int | None = None) -> OpenedPicture:
+def open_jpeg(path: Path, max_pixels: int | None) -> OpenedPicture:
     """The picture of a JPEG file, decoded whole. A damaged one is opened: its pixels count as lost. Raises
     MeasurementError for a truncated file, for one that claims more than such a file can hold, and for one of inks."""
     data = path.read_bytes()
-    samples, damage = _jpeg_samples(path, data, max_pixels)
-    exif = _exif_page(data)
-    orientation = 1 if exif is None else orientation_tag(exif)
-    bits = (picture_form(data) or (0, 0, 0, 8))[3]
-    picture = WholePicture(samples, rounding_step_dn(data), damage, 2.0**bits - 1)
-    return OpenedPicture(picture, jpeg_pitch(data), orientation_notes(orientation), orientation=orientation)
-
-
-def _jpeg_samples(path: Path, data: bytes, max_pixels: int | None) -> tuple[Samples, str]:
-    """Grey or RGB, and why it cannot be trusted; a decoder that fills a truncated file with grey is not asked."""
-    width, height, channels, _ = picture_form(data) or (0, 0, 0, 0)
+    width, height, channels, bits = picture_form(data) or (0, 0, 0, 8)
     if channels == _INKS:
         raise MeasurementError(
             f"{path} is a JPEG of four inks (CMYK), and its black ink alone may hold the marks: save it as a grey or "
             "RGB picture, or as a CMYK TIFF"
         )
     check_size(path, "a picture", (width, height), width * height * MOST_CHANNELS, len(data), max_pixels)
-    if _END not in data[_header_bytes(data) :]:
+    if _END not in data[_header_bytes(data) :]:  # a decoder would fill a truncated picture with grey
         raise damage_error(path, "its end marker is missing")
     try:
-        samples, damage = decode_checked(data, imagecodecs.jpeg_decode)
-        return grey_or_colour(samples), damage
+        decoded, damage = decode_checked(data, imagecodecs.jpeg_decode)
+        samples = grey_or_colour(decoded)
     except DECODING_ERRORS as error:
         if not width * height:
             raise damage_error(path, str(error)) from error
-        return np.zeros((height, width, 1), np.uint8), str(error)
+        samples, damage = np.zeros((height, width, 1), np.uint8), str(error)
+    picture = WholePicture(samples, rounding_step_dn(data), damage, 2.0**bits - 1)
+    exif = _exif_page(data)
+    orientation = 1 if exif is None else orientation_tag(exif)
+    return OpenedPicture(picture, jpeg_pitch(data), orientation_notes(orientation), orientation=orientation)
 
 
 def jpeg_pitch(data: bytes) -> Pitch:
@@ -270,9 +252,18 @@ def jpeg_pitch(data: bytes) -> Pitch:
 
 
 def jpeg_camera(data: bytes) -> str:
-    """The digital camera that took a stream's picture, as `taking_camera` names it."""
-    exif = _exif_page(data)
-    return "" if exif is None else taking_camera(exif)
+    """The digital camera that took a stream's picture, by maker, model and focal length; "" for a scanner's file, whose
+    Exif block has no exposure."""
+    page = _exif_page(data)
+    exif = {} if page is None else exif_tags(page)
+    if page is None or not any(tag in exif for tag in _EXPOSURE):
+        return ""
+    tags = [page.tags.valueof(name) for name in ("Make", "Model")]
+    words = [re.sub(r"[^\w ./-]", " ", tag).split() if isinstance(tag, str) else [] for tag in tags]
+    make, model = (" ".join(own)[:_LONGEST_NAME] for own in words)
+    name = model if model.lower().startswith(make.split(" ")[0].lower()) else f"{make} {model}".strip()
+    focal_mm = exif_number(exif.get("FocalLength"))
+    return (name or "a digital camera") + (f", {focal_mm:g} mm" if focal_mm else "")
 
 
 def _exif_page(data: bytes) -> TiffPage | None:
@@ -308,9 +299,15 @@ def earlier_step_dn(grey: NDArray[np.floating]) -> float:
     strength = combs.max(axis=2).sum(axis=1)
     best = int(strength.argmax())
     clearness, steps = combs[best].max(axis=1), _STEPS_DN[combs[best].argmax(axis=1)]
-    if clearness.max() < _limit(JPEG_GRID, combs.size) or not _stands_out(strength[best], np.delete(strength, best)):
+    # Whether this place differs from all others as chance does not make it (Student's t).
+    others = np.delete(strength, best)
+    spread = others.std(ddof=1) * np.sqrt(1 + 1 / len(others))
+    limit = -stdtrit(len(others) - 1, JPEG_GRID / (len(others) + 1))
+    # Of so many looks at no comb, one exceeds the quantile of the probability divided by their number.
+    is_clear = clearness.max() >= -float(ndtri(JPEG_GRID / combs.size))
+    if not is_clear or not strength[best] - others.mean() > limit * spread:
         return 0.0
-    return float(steps[clearness > _limit(JPEG_STEP, len(_STEPS_DN))].mean())
+    return float(steps[clearness > -float(ndtri(JPEG_STEP / len(_STEPS_DN)))].mean())
 
 
 def _coefficients(grey: NDArray[np.floating]) -> Array:
@@ -344,18 +341,6 @@ def _combs(coefficients: Array) -> Array:
     phases = np.cos(2 * np.pi * centres / _STEPS_DN) * counted
     clearness: Array = np.sqrt(2) * (counts @ phases) / np.sqrt(np.maximum(counts @ counted, 1))
     return clearness.reshape(places, kinds, -1)
-
-
-def _limit(chance: float, looks: int) -> float:
-    """The clearness that one of so many looks at no comb exceeds with that chance."""
-    return -float(ndtri(chance / looks))
-
-
-def _stands_out(strength: float, others: Array) -> bool:
-    """Whether one of the places differs from all others as chance does not make it (Student's t)."""
-    spread = others.std(ddof=1) * np.sqrt(1 + 1 / len(others))
-    limit = -stdtrit(len(others) - 1, JPEG_GRID / (len(others) + 1))
-    return bool(strength - others.mean() > limit * spread)
 
 
 def covariance_of_compression(rounding_step_dn: float, contrast_dn: float) -> Array:

@@ -39,7 +39,7 @@ class Jpeg2000Form:
     is_lossy: bool
 
 
-def open_jpeg2000(path: Path, max_pixels: int | None = None) -> OpenedPicture:
+def open_jpeg2000(path: Path, max_pixels: int | None) -> OpenedPicture:
     """The picture of a JPEG 2000 file, decoded whole. Raises MeasurementError for a truncated or damaged file, for one
     that claims more than such a file can hold, and for samples that are not of 2 to 16 bits without sign."""
     data = path.read_bytes()
@@ -58,8 +58,7 @@ def open_jpeg2000(path: Path, max_pixels: int | None = None) -> OpenedPicture:
     try:
         decoded = imagecodecs.jpeg2k_decode(data)
         bands = 1 if decoded.ndim == 2 else decoded.shape[2]
-        taken = decoded if bands <= 4 else decoded[..., :3]
-        samples = grey_or_colour(taken)
+        samples = grey_or_colour(decoded if bands <= 4 else decoded[..., :3])
     except DECODING_ERRORS as error:
         raise damage_error(path, str(error)) from error
     notes = (_LOSSY,) if form.is_lossy else ()

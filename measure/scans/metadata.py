@@ -1,7 +1,6 @@
 """Metadata of a scan file: pitch, orientation, conversion of stored numbers to grey values; and their checks."""
 
 import math
-import re
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tifffile import TiffFileError, TiffPage
 
-from measure.errors import MeasurementError, MissingError, TooLargeError
+from measure.errors import MeasurementError, TooLargeError
 
 # Errors that decoders raise for invalid files.
 DECODING_ERRORS = (
@@ -36,11 +35,9 @@ _CIELAB, _ICCLAB = 8, 9
 _ICCLAB_FULL_DN = 65280.0  # L* of 100 in 16 bits (TIFF Technical Note 4); CIELab's is all ones (TIFF 6.0, section 23)
 _INK_WEIGHTS = (0.299, 0.587, 0.114)  # of red, green and blue, the complements of cyan, magenta and yellow
 _UNSIGNED, _SIGNED, _FLOATING = 1, 2, 3  # SampleFormat
-_WORD_DN = 65535.0
+WORD_DN = 65535.0
 _INK_SET = 332  # 1: cyan, magenta, yellow and black
 _EXIF = 34665  # the tag of an Exif block (Exif 2.3)
-_EXPOSURE = ("FocalLength", "FNumber", "ExposureTime", "ISOSpeedRatings")  # Exif tags of a digital camera
-_LONGEST_NAME = 60
 MOST_CHANNELS = 4  # colours and transparency
 _COARSEST_UM = 250.0  # about 100 dpi; 72 and 96 dpi are defaults of programs
 _FINEST_UM = 1.0  # finer than any film scanner
@@ -91,34 +88,6 @@ def check_size(
         f"{path} claims {what} of {width} x {height} pixels ({decoded_bytes} bytes), stored in {stored_bytes} bytes: "
         f"{bound}. If it is truly so large, give --max-pixels {pixels}; else the file is damaged: copy it again"
     )
-
-
-def no_picture_error(path: Path, start: bytes) -> MeasurementError:
-    """Error for a file that is not an image; start: its first bytes."""
-    return MeasurementError(
-        f"{path} is no TIFF, JPEG, JPEG 2000 or PNG picture (it begins with {start[:8]!r}): give the scan itself, or "
-        "convert it"
-    )
-
-
-def first_bytes(path: Path) -> bytes:
-    """Read the first 16 bytes of a file. A pipe or device is not opened, since reading might never end."""
-    try:
-        if path.exists() and not (path.is_file() or path.is_dir()):
-            raise MeasurementError(f"{path} is no regular file, but a pipe or a device: give the file of a scan")
-        with path.open("rb") as file:
-            start = file.read(16)
-    except FileNotFoundError:
-        raise MissingError(
-            f"there is no scan {path} (searched at {path.absolute()}): check its name and its folder"
-        ) from None
-    except OSError as error:
-        raise MeasurementError(
-            f"{path} cannot be read: {error.strerror}; check that it is a file you may read"
-        ) from error
-    if not start:
-        raise MeasurementError(f"{path} is empty (0 bytes): copy or scan it again")
-    return start
 
 
 @dataclass(frozen=True)
@@ -180,17 +149,6 @@ class Radiometry:
         """Number of samples of a pixel that are used, from the first one."""
         return self.bands if self.inks_full else self.channels
 
-    @classmethod
-    def from_palette(cls, colormap: NDArray[np.generic]) -> "Radiometry":
-        """Radiometry of a palette image. colormap (3, entries): 16 bits, in some old files 8; grey ones give one
-        channel."""
-        palette = np.asarray(colormap, np.uint16).T
-        if palette.max() < 256:
-            palette = palette * np.uint16(257)
-        if np.all(palette == palette[:, :1]):
-            palette = palette[:, :1]
-        return cls(palette.shape[1], 65535.0, palette=np.ascontiguousarray(palette))
-
     @property
     def sample_bytes(self) -> int:
         return 1 if self.full_scale_dn < 256 else 2
@@ -208,13 +166,10 @@ class Radiometry:
         if self.span is not None:
             low, high = self.span
             share = (np.nan_to_num(stored[..., : self.channels].astype(np.float64), nan=low) - low) / (high - low)
-            return self._uninverted(np.rint(self.full_scale_dn * np.clip(share, 0.0, 1.0)).astype(dtype))
-        if stored.dtype.kind == "i":
+            stored = np.rint(self.full_scale_dn * np.clip(share, 0.0, 1.0))
+        elif stored.dtype.kind == "i":
             stored = np.maximum(stored, 0)
         samples: Samples = np.ascontiguousarray(stored[..., : self.channels], dtype)
-        return self._uninverted(samples)
-
-    def _uninverted(self, samples: Samples) -> Samples:
         return samples.dtype.type(self.full_scale_dn) - samples if self.inverted else samples
 
 
@@ -264,11 +219,16 @@ def page_radiometry(page: TiffPage, path: Path) -> Radiometry:
     if page.imagedepth != 1:
         raise unsupported_error(path, f"it is a volume of {page.imagedepth} slices")
     if kind == _PALETTE and page.colormap is not None:
-        return Radiometry.from_palette(page.colormap)
+        palette = np.asarray(page.colormap, np.uint16).T
+        if palette.max() < 256:  # of 16 bits, in some old files 8
+            palette = palette * np.uint16(257)
+        if np.all(palette == palette[:, :1]):
+            palette = palette[:, :1]
+        return Radiometry(palette.shape[1], WORD_DN, palette=np.ascontiguousarray(palette))
     is_jpeg, plain = page.compression in JPEG_COMPRESSIONS, page.sampleformat == _UNSIGNED
     if kind == _SEPARATED and samples >= 4 and plain and not is_jpeg and page.tags.valueof(_INK_SET, default=1) == 1:
         note = "its colours are inks (CMYK): the luminance of their print is used"
-        return Radiometry(1, _WORD_DN, inks_full=float(2**bits - 1), bands=4, note=note)
+        return Radiometry(1, WORD_DN, inks_full=float(2**bits - 1), bands=4, note=note)
     if kind in (_CIELAB, _ICCLAB) and plain and bits in (8, 16) and not is_jpeg:
         full = _ICCLAB_FULL_DN if kind == _ICCLAB and bits == 16 else float(2**bits - 1)
         return Radiometry(1, full, bands=3, note="its colours are CIE L*a*b*: the lightness L* is used")
@@ -279,36 +239,11 @@ def page_radiometry(page: TiffPage, path: Path) -> Radiometry:
     channels, inverted = 3 if is_colour else 1, kind == WHITE_IS_ZERO
     if is_float:
         note = f"its samples are floating-point numbers of {bits} bits: they are taken in 65535 steps"
-        return Radiometry(channels, _WORD_DN, inverted, note=note)
+        return Radiometry(channels, WORD_DN, inverted, note=note)
     if page.sampleformat == _SIGNED:
         note = f"its samples are signed numbers of {bits} bits: negative ones are taken for 0"
         return Radiometry(channels, float(2 ** (bits - 1) - 1), inverted, note=note)
     return Radiometry(channels, float(2**bits - 1), inverted)
-
-
-def float_span(least: float, greatest: float) -> tuple[float, float]:
-    """Floating-point numbers that map to 0 and full scale: the smallest usual scale that holds all values, else the
-    extremes."""
-    low = min(least, 0.0)
-    return low, next(
-        (full for full in (1.0, 255.0, _WORD_DN) if low == 0.0 and greatest <= full), max(greatest, low + 1e-9)
-    )
-
-
-def taking_camera(page: TiffPage) -> str:
-    """Digital camera of an image by maker, model and focal length; "" for a scanner's file, whose Exif block has no
-    exposure."""
-    exif = exif_tags(page)
-    if not any(tag in exif for tag in _EXPOSURE):
-        return ""
-    make, model = (_words(page.tags.valueof(tag)) for tag in ("Make", "Model"))
-    name = model if model.lower().startswith(make.split(" ")[0].lower()) else f"{make} {model}".strip()
-    focal_mm = exif_number(exif.get("FocalLength"))
-    return (name or "a digital camera") + (f", {focal_mm:g} mm" if focal_mm else "")
-
-
-def _words(tag: object) -> str:
-    return " ".join(re.sub(r"[^\w ./-]", " ", tag).split())[:_LONGEST_NAME] if isinstance(tag, str) else ""
 
 
 def exif_number(tag: object) -> float | None:

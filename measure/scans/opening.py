@@ -7,21 +7,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from measure.errors import MeasurementError
+from measure.errors import MeasurementError, MissingError
 from measure.scans.cache import LostPart, OpenedPicture, Segments, WholePicture
 from measure.scans.jpeg import JPEG_START, jpeg_camera, jpeg_colour_tags, jpeg_pitch, open_jpeg, picture_form
 from measure.scans.jpeg2000 import JPEG2000_STARTS, jpeg2000_form, jpeg2000_pitch, open_jpeg2000
-from measure.scans.metadata import (
-    DECODING_ERRORS,
-    Pitch,
-    Samples,
-    check_size,
-    damage_error,
-    first_bytes,
-    no_picture_error,
-)
+from measure.scans.metadata import DECODING_ERRORS, Pitch, Samples, check_size, damage_error
 from measure.scans.parallel import map_in_threads
 from measure.scans.png import PNG_START, open_png, png_colour_tags, png_form, png_pitch
 from measure.scans.remote import Address, ScanPart, Window, scan_path
@@ -30,6 +21,12 @@ from measure.scans.tiff import TIFF_STARTS, open_tiff, tiff_colour_tags
 from measure.tone.curve import Tone
 from measure.tone.declared import tone_of_tags
 
+_OPENERS = {
+    **dict.fromkeys(TIFF_STARTS, open_tiff),
+    JPEG_START: open_jpeg,
+    PNG_START: open_png,
+    **dict.fromkeys(JPEG2000_STARTS, open_jpeg2000),
+}
 _HEADERS_BYTES = 1 << 18  # head of a JPEG or PNG file: profiles and Exif blocks are smaller
 _END_BYTES = 1 << 16  # end of a complete JPEG or PNG file, which holds the end marker
 _BAND_PX = 1 << 18  # approximate number of pixels read at a time
@@ -57,21 +54,43 @@ def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
     ...     grey = scan.window(100, 200, 64, 64)
     """
     path = scan_path(path)
-    start = first_bytes(path)
-    if isinstance(path, ScanPart) and (path.page or 1) > 1 and start[:4] not in TIFF_STARTS:
+    start = _file_start(path)
+    if isinstance(path, ScanPart) and (path.page or 1) > 1 and start not in TIFF_STARTS:
         raise MeasurementError(f"{path}: such a file has one page: take `page` out of images.csv")
-    openers = dict.fromkeys(TIFF_STARTS, open_tiff) | {JPEG_START: open_jpeg, PNG_START: open_png}
-    openers |= dict.fromkeys(JPEG2000_STARTS, open_jpeg2000)
-    open_picture = next((openers[first] for first in openers if start.startswith(first)), None)
-    if open_picture is None:
-        raise no_picture_error(path, start)
-    opened = open_picture(path, max_pixels)
+    opened = _OPENERS[start](path, max_pixels)
     segments = opened.segments
     is_one = segments.segment_height_px >= segments.height_px and segments.segment_width_px >= segments.width_px
     if isinstance(path, Address) and is_one:
         whole = "the file has its picture in one piece, and was fetched whole: of tiles, most would not be"
         opened = replace(opened, notes=(*opened.notes, whole))
     return Scan(path, segments, opened.pitch, opened)
+
+
+def _file_start(path: Path) -> bytes:
+    """The bytes of `_OPENERS` that a file begins with. A pipe or device is not opened: reading might never end."""
+    try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise MeasurementError(f"{path} is no regular file, but a pipe or a device: give the file of a scan")
+        with path.open("rb") as file:
+            begin = file.read(16)
+    except FileNotFoundError:
+        message = f"there is no scan {path} (searched at {path.absolute()}): check its name and its folder"
+        raise MissingError(message) from None
+    except OSError as error:
+        raise _reading_error(path, error) from error
+    if not begin:
+        raise MeasurementError(f"{path} is empty (0 bytes): copy or scan it again")
+    start = next((start for start in _OPENERS if begin.startswith(start)), None)
+    if start is None:
+        raise MeasurementError(
+            f"{path} is no TIFF, JPEG, JPEG 2000 or PNG picture (it begins with {begin[:8]!r}): give the scan itself, "
+            "or convert it"
+        )
+    return start
+
+
+def _reading_error(path: Path, error: OSError) -> MeasurementError:
+    return MeasurementError(f"{path} cannot be read: {error.strerror}; check that it is a file you may read")
 
 
 @dataclass(frozen=True)
@@ -102,20 +121,25 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
         If head and length show that the file cannot be opened as a scan. Damage within a JPEG, JPEG 2000 or PNG image
         is found only by decoding.
     """
-    start = first_bytes(path)
-    if start[:4] in TIFF_STARTS:
+    start = _file_start(path)
+    if start in TIFF_STARTS:
         opened = open_tiff(path, max_pixels)
         segments, notes = opened.segments, (*opened.problems, *opened.notes)
         segments.close()
         bits = int(segments.full_scale_dn + 1).bit_length() - 1
         return ScanHead("TIFF", segments.width_px, segments.height_px, segments.channels, bits, opened.pitch, notes)
-    if not start.startswith((JPEG_START, PNG_START, *JPEG2000_STARTS)):
-        raise no_picture_error(path, start)
-    data, end = _head_and_end(path)
+    try:
+        file_bytes = path.stat().st_size
+        with path.open("rb") as file:
+            data = file.read(_HEADERS_BYTES)
+            file.seek(max(file_bytes - _END_BYTES, 0))
+            end = file.read()
+    except OSError as error:
+        raise _reading_error(path, error) from error
     form: tuple[int, int, int, int] | None
-    if start.startswith(JPEG_START):
+    if start == JPEG_START:
         file_format, form, marker, pitch = "JPEG", picture_form(data), b"\xff\xd9", jpeg_pitch(data)
-    elif start.startswith(JPEG2000_STARTS):
+    elif start in JPEG2000_STARTS:
         file_format, own, marker, pitch = "JPEG 2000", jpeg2000_form(data), b"\xff\xd9", jpeg2000_pitch(data)
         form = None if own is None else (own.width_px, own.height_px, own.channels, own.bits)
     else:
@@ -125,7 +149,7 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
     if marker not in end:
         open_scan(path, max_pixels).close()  # fails unless the marker only precedes trailing data
     width, height, channels, bits = form
-    check_size(path, "a picture", (width, height), width * height * channels, path.stat().st_size, max_pixels)
+    check_size(path, "a picture", (width, height), width * height * channels, file_bytes, max_pixels)
     camera = jpeg_camera(data) if file_format == "JPEG" else ""
     return ScanHead(file_format, width, height, min(channels, 3), bits, pitch, camera=camera)
 
@@ -140,18 +164,6 @@ def declared_tone(path: Path) -> Tone | None:
         return tone_of_tags(png_colour_tags(path) if start.startswith(PNG_START) else jpeg_colour_tags(path))
     except (*DECODING_ERRORS, zlib.error):
         return None
-
-
-def _head_and_end(path: Path) -> tuple[bytes, bytes]:
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEADERS_BYTES)
-            file.seek(max(path.stat().st_size - _END_BYTES, 0))
-            return head, file.read()
-    except OSError as error:
-        raise MeasurementError(
-            f"{path} cannot be read: {error.strerror}; check that it is a file you may read"
-        ) from error
 
 
 def crop_scan(scan: Scan, window: Window) -> Scan:
@@ -211,24 +223,19 @@ def thumbnail(scan: Scan, largest_px: int) -> Scan:
     """Grey values of a scan with 16 bits, area-averaged so that no side exceeds largest_px; the pitch is scaled
     accordingly."""
     shrunk = max(max(scan.width_px, scan.height_px) / largest_px, 1.0)
-    grey, unit = _reduced(scan, int(shrunk)), _FULL_SCALE_DN / scan.full_scale_dn
+    factor, unit = int(shrunk), _FULL_SCALE_DN / scan.full_scale_dn
+    grey = np.empty((scan.height_px // factor, scan.width_px // factor), np.uint16)
+    rows = max(_BAND_PX // scan.width_px // factor, 1)
+
+    def fill(row: int) -> None:
+        """Average a band of rows; the whole scan at once would take its memory."""
+        band = grey[row : row + rows]
+        band[:] = np.rint(np.float32(unit) * scan.reduced_window(factor, 0, row, grey.shape[1], len(band)))
+
+    map_in_threads(fill, range(0, len(grey), rows))
     size = round(scan.width_px / shrunk), round(scan.height_px / shrunk)
     same = size == grey.shape[::-1]
     samples = grey if same else np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint16)
     pitch = Pitch(None if scan.pitch_um is None else (shrunk * scan.pitch_um[0], shrunk * scan.pitch_um[1]))
     picture = WholePicture(samples[:, :, None], scan.rounding_step_dn * unit / shrunk)
     return Scan(scan.path, picture, pitch)
-
-
-def _reduced(scan: Scan, factor: int) -> NDArray[np.uint16]:
-    """Grey values with 16 bits, averaged by an integer factor, band by band to limit memory."""
-    unit = np.float32(_FULL_SCALE_DN / scan.full_scale_dn)
-    grey = np.empty((scan.height_px // factor, scan.width_px // factor), np.uint16)
-    rows = max(_BAND_PX // scan.width_px // factor, 1)
-
-    def fill(row: int) -> None:
-        band = grey[row : row + rows]
-        band[:] = np.rint(unit * scan.reduced_window(factor, 0, row, grey.shape[1], len(band)))
-
-    map_in_threads(fill, range(0, len(grey), rows))
-    return grey

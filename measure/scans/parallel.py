@@ -11,11 +11,9 @@ Item = TypeVar("Item")
 Made = TypeVar("Made")
 
 
-def map_items(
-    workers: Executor | None, function: Callable[[Item], Made], items: Sequence[Item], chunk: int = 1
-) -> Iterator[Made]:
-    """Map a function over items, in their order. chunk: items per task."""
-    return map(function, items) if workers is None else workers.map(function, items, chunksize=chunk)
+def map_items(workers: Executor | None, function: Callable[[Item], Made], items: Sequence[Item]) -> Iterator[Made]:
+    """Map a function over items, in their order."""
+    return map(function, items) if workers is None else workers.map(function, items)
 
 
 def map_or_replace(
@@ -33,8 +31,14 @@ def map_or_replace(
         yield from map(function, items)
         return
     parts = [items[first : first + chunk] for first in range(0, len(items), chunk)]
-    working = [_submitted(workers, function, part) for part in parts]
-    for part, future in zip(parts, working, strict=True):
+    futures = list[Future[list[Made]]]()
+    for part in parts:
+        try:
+            futures.append(workers.submit(_each, function, part))
+        except BrokenExecutor as error:
+            futures.append(Future())
+            futures[-1].set_exception(error)
+    for part, future in zip(parts, futures, strict=True):
         try:
             yield from future.result()
         except BrokenExecutor as error:
@@ -42,15 +46,6 @@ def map_or_replace(
                 yield lost(part[0], str(error))
             else:  # one of them killed the worker: find out which
                 yield from map_or_replace(workers, function, part, lost)
-
-
-def _submitted(workers: Executor, function: Callable[[Item], Made], part: Sequence[Item]) -> "Future[list[Made]]":
-    try:
-        return workers.submit(_each, function, part)
-    except BrokenExecutor as error:
-        future: Future[list[Made]] = Future()
-        future.set_exception(error)
-        return future
 
 
 def _each(function: Callable[[Item], Made], part: Sequence[Item]) -> list[Made]:

@@ -15,7 +15,6 @@ from measure.scans.metadata import (
     NO_TAGS,
     PNG_UNIT,
     Pitch,
-    Samples,
     check_size,
     damage_error,
     grey_or_colour,
@@ -28,15 +27,10 @@ _PNG_HEADER = ">IIBB"  # width, height, bits and kind of colour (PNG specificati
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 1, 6: 3}  # by that kind, without transparency; a palette has colours
 
 
-def open_png(path: Path, max_pixels: int | None = None) -> OpenedPicture:
+def open_png(path: Path, max_pixels: int | None) -> OpenedPicture:
     """The picture of a PNG file, decoded whole. Raises MeasurementError for a truncated or damaged file, and for one
     that claims more than such a file can hold."""
     data = path.read_bytes()
-    return OpenedPicture(WholePicture(_png_samples(path, data, max_pixels)), png_pitch(data))
-
-
-def _png_samples(path: Path, data: bytes, max_pixels: int | None) -> Samples:
-    """Grey or RGB, 8 or 16 bits."""
     form = png_form(data)
     if form is None:
         raise damage_error(path, "its header is cut short")
@@ -49,9 +43,10 @@ def _png_samples(path: Path, data: bytes, max_pixels: int | None) -> Samples:
     decoded_bytes = width * height * MOST_CHANNELS * -(-bits // 8)
     check_size(path, "a picture", (width, height), decoded_bytes, len(data), max_pixels)
     try:
-        return grey_or_colour(imagecodecs.png_decode(data))
+        samples = grey_or_colour(imagecodecs.png_decode(data))
     except DECODING_ERRORS as error:
         raise damage_error(path, str(error)) from error
+    return OpenedPicture(WholePicture(samples), png_pitch(data))
 
 
 def png_pitch(data: bytes) -> Pitch:

@@ -14,12 +14,9 @@ from importlib import import_module
 from io import BufferedIOBase
 from pathlib import Path, PosixPath
 from threading import Lock
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from measure.errors import MeasurementError, MissingError, UnreachableError
-
-if TYPE_CHECKING:
-    from tifffile import TiffFile
 
 Window = tuple[int, int, int, int]  # first column and row, width and height, px
 
@@ -35,8 +32,6 @@ _KEPT_OBJECTS = 8  # whose blocks are held
 _WAITS_S = (0.1, 0.5, 2.0)  # before an address is asked again
 _TIMEOUT_S = 30.0  # without a byte
 _CHECKSUMS = ("ETag", "Content-MD5", "Digest", "Last-Modified")  # of which servers give at least one, mostly
-
-
 _SECRET = re.compile(
     r"x-(amz|goog|oss|ms|cos)-.*|.*(token|secret|passw|credential|accesskey|signature|api_?-?key|auth).*|googleaccessid|"
     r"key-pair-id|policy|sig|expires|exp|pwd|hmac|md5|st|se|sp|sr|sv|spr|sip|ss|srt|sk[a-z]{1,3}|sdd|sas|ticket|"
@@ -71,12 +66,8 @@ class ScanPart(PosixPath):
 
     def _groups(self) -> tuple[str, ...]:
         match = _PART.fullmatch(str(self))
-        assert match is not None, f"{self} names no part of a scan: `is_scan_part` tells"
+        assert match is not None, f"{self} names no part of a scan: `scan_path` tells"
         return match.groups()
-
-
-def is_scan_part(text: str) -> bool:
-    return _PART.fullmatch(text) is not None
 
 
 def whole_file(text: str) -> str:
@@ -192,7 +183,20 @@ class Address(PosixPath):
         """The bytes of several places, asked for together."""
         system = _file_system(self)
         starts, ends = [first for first, _ in extents], [after for _, after in extents]
-        parts = _retry(self, lambda: _fetch_ranges(self, system.cat_ranges, starts, ends))
+
+        def fetch() -> list[bytes]:
+            fetched: list[bytes] = system.cat_ranges([self.location] * len(starts), starts, ends, on_error="raise")
+            for part, start, end in zip(fetched, starts, ends, strict=True):
+                if len(part) > end - start:
+                    raise UnreachableError(
+                        f"{self}: its server gives no parts of files (no ranges of bytes). Download it, and name the "
+                        "file."
+                    )
+                if len(part) < end - start:
+                    raise ConnectionError(f"{len(part)} bytes came in place of {end - start}")
+            return fetched
+
+        parts = _retry(self, fetch)
         with _holding:
             TRAFFIC.ranges += len(parts)
             TRAFFIC.bytes += sum(map(len, parts))
@@ -215,7 +219,7 @@ def scan_path(text: str | Path) -> Path:
     """The file or the address that a text names, or the part of a file."""
     if isinstance(text, Path):
         return text
-    kind = ScanPart if is_scan_part(text) else Address if is_address(text) else Path
+    kind = ScanPart if _PART.fullmatch(text) else Address if is_address(text) else Path
     return kind(text)
 
 
@@ -271,13 +275,6 @@ def list_addresses(address: Address) -> list[Path]:
         folders += sorted(name for name in below if name.endswith("/"))
         files |= {name for name in below if not name.endswith("/")}
     return [Address(name) for name in sorted(files)]
-
-
-def tiff_file(path: Path) -> "TiffFile":
-    """A TIFF file opened, wherever it is. Raises one of DECODING_ERRORS, or as `Address` does."""
-    from tifffile import TiffFile
-
-    return TiffFile(path.open("rb") if isinstance(path, Address) else path)
 
 
 @dataclass
@@ -348,18 +345,6 @@ def _query_object(address: Address) -> _RemoteObject:
         while len(_objects) > _KEPT_OBJECTS:
             _objects.popitem(last=False)
     return known
-
-
-def _fetch_ranges(address: Address, cat_ranges: Any, starts: list[int], ends: list[int]) -> list[bytes]:
-    parts: list[bytes] = cat_ranges([address.location] * len(starts), starts, ends, on_error="raise")
-    for part, start, end in zip(parts, starts, ends, strict=True):
-        if len(part) > end - start:
-            raise UnreachableError(
-                f"{address}: its server gives no parts of files (no ranges of bytes). Download it, and name the file."
-            )
-        if len(part) < end - start:
-            raise ConnectionError(f"{len(part)} bytes came in place of {end - start}")
-    return parts
 
 
 def _retry(address: Address, ask: Callable[[], Made]) -> Made:

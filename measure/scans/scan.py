@@ -45,6 +45,7 @@ class Scan:
     ----------
     width_px, height_px : int
     channels : 1 or 3.
+    weights : (channels,) weights of the channels in the grey values.
     full_scale_dn : largest grey value of the bit depth.
     tone : tone curve between light and grey values, with its uncertainty.
     pitch_um : (x, y) from the resolution tags; None where there are no credible ones, for the reason in pitch_note.
@@ -72,12 +73,7 @@ class Scan:
         self._source = segments if isinstance(segments, RawRows) else self._cache
         self._reduced: dict[int, Single] = {}
         self._overviews = [Scan(path, own, pitch) for own in opened.overviews]
-        self._grey_weights: Sequence[float] = (1.0,) if self.channels == 1 else LUMINANCE
-
-    @property
-    def weights(self) -> Sequence[float]:
-        """(channels,) weights of the channels in the grey values."""
-        return self._grey_weights
+        self.weights: Sequence[float] = (1.0,) if self.channels == 1 else LUMINANCE
 
     @cached_property
     def rounding_step_dn(self) -> float:
@@ -142,7 +138,7 @@ class Scan:
     def replace_weights(self, weights: Sequence[float]) -> "Scan":
         """The scan with another weighted mean (channels,) of its channels as its grey value."""
         scan = copy(self)
-        scan._grey_weights = weights
+        scan.weights = weights
         return scan
 
     def green_channel(self) -> "Scan":
@@ -253,7 +249,7 @@ class Scan:
     @property
     def last_reduction(self) -> tuple[int, Single] | None:
         """Factor and grey values of the last reduction of the whole scan; None before the first one."""
-        return next(((f, weighted(grey, self._grey_weights)) for f, grey in self._reduced.items()), None)
+        return next(((f, weighted(grey, self.weights)) for f, grey in self._reduced.items()), None)
 
     def reduced_window(
         self, factor: int, col0: int, row0: int, width: int, height: int, weights: Sequence[float] | None = None
@@ -303,7 +299,9 @@ class Scan:
     def _reduced_channels(self, factor: int, width: int, height: int) -> Single:
         """(height, width, channels) reduction of the whole scan; every segment is decoded once."""
         if overview := self._overview(factor):
-            return overview._enlarged_to(self, factor, width, height)
+            whole, scale, shift = overview._steps_to(self, factor)
+            picture = overview._reduced_channels(whole, overview.width_px // whole, overview.height_px // whole)
+            return _interpolated(picture, scale, shift, width, height)
         result = np.empty((height, width, self.channels), np.float32)
         tall, wide = self.segment_px
         cols = width if wide >= self.width_px else _reduced_side(wide, factor, _PART_PX)
@@ -330,15 +328,9 @@ class Scan:
             first, last = np.array([col0, row0]), np.array([col0 + width, row0 + height]) - 1
             low = np.floor(scale * first + shift).astype(int)
             high = np.ceil(scale * last + shift).astype(int) + 1
-            means_ = overview._reduced_part(whole, *low.tolist(), *(high - low).tolist())
-            return _interpolated(means_, scale, scale * first + shift - low, width, height)
+            picture = overview._reduced_part(whole, *low.tolist(), *(high - low).tolist())
+            return _interpolated(picture, scale, scale * first + shift - low, width, height)
         return means(self.samples(col0 * factor, row0 * factor, width * factor, height * factor), factor)
-
-    def _enlarged_to(self, scan: "Scan", factor: int, width: int, height: int) -> Single:
-        """Resample this overview to the size of its scan reduced by a factor."""
-        whole, scale, shift = self._steps_to(scan, factor)
-        means_ = self._reduced_channels(whole, self.width_px // whole, self.height_px // whole)
-        return _interpolated(means_, scale, shift, width, height)
 
     def _steps_to(self, scan: "Scan", factor: int) -> tuple[int, NDArray[np.float64], NDArray[np.float64]]:
         """Resampling from this overview to its scan reduced by a factor: integer factor of averaging, then step (x, y)
@@ -350,7 +342,7 @@ class Scan:
 
     def _weights(self, weights: Sequence[float] | None) -> Sequence[float]:
         if weights is None:
-            weights = self._grey_weights
+            weights = self.weights
         if len(weights) != self.channels:
             raise ValueError(f"{self.name}: {len(weights)} weights for {self.channels} channels")
         return weights

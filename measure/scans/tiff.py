@@ -14,7 +14,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import product
-from mmap import ACCESS_READ, ALLOCATIONGRANULARITY, mmap
 from pathlib import Path
 from threading import Lock
 
@@ -31,19 +30,19 @@ from measure.scans.metadata import (
     DECODING_ERRORS,
     JPEG_COMPRESSIONS,
     WHITE_IS_ZERO,
+    WORD_DN,
     Radiometry,
     Samples,
     check_size,
     damage_error,
     exif_tags,
-    float_span,
     orientation_notes,
     orientation_tag,
     page_radiometry,
     tag_pitch,
     unsupported_error,
 )
-from measure.scans.remote import Address, ScanPart, tiff_file
+from measure.scans.remote import Address, ScanPart
 from measure.tone.declared import ColourTags
 
 Extent = tuple[int, int]
@@ -64,7 +63,7 @@ TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the first bytes of TIF
 _UNCOMPRESSED = 1  # of Compression (TIFF 6.0)
 _LOOKED_AT_BYTES = 1 << 16  # after the last that a file accounts for
 _JPEG_HEADERS_BYTES = 4096  # tables, size and resolution take fewer
-_REDUCED_IMAGE, _TRANSPARENCY_MASK = 1, 4  # bits of NewSubfileType
+_REDUCED_IMAGE, _NOT_WHOLE = 1, 1 | 4  # bits of NewSubfileType: reduced, and reduced or a transparency mask
 _ALPHA = (1, 2)  # of ExtraSamples: associated and unassociated transparency
 _FULL_SIZE = 0.6  # of the largest picture's side: what is smaller is an overview
 _INTO_MEMORY = (5, 8, 32773, 32946, 34926, 50000)  # LZW, deflate, PackBits, zstd: these give bytes
@@ -97,9 +96,7 @@ def check_directories(file: TiffFile) -> list[Extent]:
             raise BadDirectory(f"it lists more than {_MOST_DIRECTORIES} pictures")
         found.add(place)
         try:
-            tags, following = _directory(file, place)
-            for tag in tags if is_picture else ():
-                _check_tag(tag, file.filehandle.size)
+            tags, following = _directory(file, place, is_picture)
         except BadDirectory:
             if is_picture:
                 raise
@@ -118,8 +115,8 @@ def _number(file: TiffFile, form: str) -> int:
         raise BadDirectory("its list of tags is cut short") from None
 
 
-def _directory(file: TiffFile, place: int) -> tuple[list[TiffTag], int]:
-    """A directory's tags, and the place of the next one."""
+def _directory(file: TiffFile, place: int, is_picture: bool) -> tuple[list[TiffTag], int]:
+    """A directory's tags, and the place of the next one. Of a picture, those that it is read by are checked."""
     file.filehandle.seek(place)
     count = _number(file, file.tiff.tagnoformat)
     if count > _MOST_TAGS:
@@ -129,23 +126,20 @@ def _directory(file: TiffFile, place: int) -> tuple[list[TiffTag], int]:
     following = _number(file, file.tiff.offsetformat)
     steps = range(0, len(stored), file.tiff.tagsize)
     heads = ((first + step, stored[step : step + file.tiff.tagsize]) for step in steps)
-    return [TiffTag.fromfile(file, offset=at, header=head, validate=False) for at, head in heads], following
-
-
-def _check_tag(tag: TiffTag, file_bytes: int) -> None:
-    """One tag, if it is one that pictures are read by."""
-    if tag.code not in _ONE_NUMBER | _NUMBERS:
-        return
-    name = TIFF.TAGS[tag.code]
-    if tag.dtype not in _WHOLE:
-        raise BadDirectory(f"its tag {name} is no whole number (type {int(tag.dtype)})")
-    if tag.count < 1 or (tag.code in _ONE_NUMBER and tag.count != 1):
-        only = ", not one" if tag.code in _ONE_NUMBER else ""
-        raise BadDirectory(f"its tag {name} holds {tag.count} numbers{only}")
-    if tag.valueoffset + tag.valuebytecount > file_bytes:
-        raise BadDirectory(f"the {tag.count} numbers of its tag {name} lie beyond its end of {file_bytes} bytes")
-    if tag.code in _SIZES and _numbers(tag) == [0]:
-        raise BadDirectory(f"its tag {name} is 0")
+    tags = [TiffTag.fromfile(file, offset=at, header=head, validate=False) for at, head in heads]
+    file_bytes = file.filehandle.size
+    for tag in (tag for tag in tags if is_picture and tag.code in _ONE_NUMBER | _NUMBERS):
+        name = TIFF.TAGS[tag.code]
+        if tag.dtype not in _WHOLE:
+            raise BadDirectory(f"its tag {name} is no whole number (type {int(tag.dtype)})")
+        if tag.count < 1 or (tag.code in _ONE_NUMBER and tag.count != 1):
+            only = ", not one" if tag.code in _ONE_NUMBER else ""
+            raise BadDirectory(f"its tag {name} holds {tag.count} numbers{only}")
+        if tag.valueoffset + tag.valuebytecount > file_bytes:
+            raise BadDirectory(f"the {tag.count} numbers of its tag {name} lie beyond its end of {file_bytes} bytes")
+        if tag.code in _SIZES and _numbers(tag) == [0]:
+            raise BadDirectory(f"its tag {name} is 0")
+    return tags, following
 
 
 def _extents(tags: Sequence[TiffTag], file: TiffFile) -> Iterator[Extent]:
@@ -168,7 +162,7 @@ def _numbers(tag: TiffTag) -> list[int]:
     return [int(number) for number in np.ravel(tag.value)]
 
 
-def open_tiff(path: Path, max_pixels: int | None = None) -> OpenedPicture:
+def open_tiff(path: Path, max_pixels: int | None) -> OpenedPicture:
     """The first full-resolution picture of a TIFF file, or that of the page that the path names.
 
     Of an address the overviews are opened, too. Of a local file the picture itself is averaged, for how others averaged
@@ -176,7 +170,7 @@ def open_tiff(path: Path, max_pixels: int | None = None) -> OpenedPicture:
     know, and for those that claim more than such a file can hold.
     """
     try:
-        file = tiff_file(path)
+        file = _tiff_file(path)
     except DECODING_ERRORS as error:
         # Others than these are of tags that are no numbers, or several.
         reason = str(error) if isinstance(error, OSError | TiffFileError) else "its list of tags is damaged"
@@ -184,11 +178,17 @@ def open_tiff(path: Path, max_pixels: int | None = None) -> OpenedPicture:
     try:
         taken = check_directories(file)
         page, problems = _main_page(file, path)
-        _check_original(page, path)
+        if re.match(r'\s*\{"reseau": .*"pitch_mm": ', page.description):
+            # In a resampled frame the film is gone from the marks' places, and the noise from their uncertainty.
+            raise MeasurementError(
+                f"{path}: is a frame that reseau has resampled, and no scan. Measure the scan that it was made of."
+            )
         radiometry = page_radiometry(page, path)
         _check_sizes(page, path, max_pixels)
         _check_extent(page, path, taken)
-        kind = RawRows if _is_raw(page) else TiffSegments
+        has_rows_in_order = page.is_contiguous and not page.is_tiled and page.predictor == 1 and page.fillorder == 1
+        is_raw = has_rows_in_order and (page.planarconfig == 1 or page.samplesperpixel == 1)
+        kind = RawRows if is_raw else TiffSegments
         segments: Segments = kind(file, page, path, radiometry, _page_rounding_step_dn(file, page))
         overviews = _overviews(file, page, path) if isinstance(path, Address) else ()
         orientation = orientation_tag(page)
@@ -200,6 +200,11 @@ def open_tiff(path: Path, max_pixels: int | None = None) -> OpenedPicture:
     except BaseException:
         file.close()
         raise
+
+
+def _tiff_file(path: Path) -> TiffFile:
+    """A TIFF file opened, wherever it is. Raises one of DECODING_ERRORS, or as `Address` does."""
+    return TiffFile(path.open("rb") if isinstance(path, Address) else path)
 
 
 def _main_page(file: TiffFile, path: Path) -> tuple[TiffPage, tuple[str, ...]]:
@@ -230,7 +235,8 @@ def _full_pictures(file: TiffFile) -> dict[int, list[TiffPage]]:
     held: dict[int, list[TiffPage]] = {}
     for number, page in enumerate((page.aspage() for page in file.pages), 1):
         below = page.pages if page.subifds and page.pages is not None else ()
-        own = [one for one in (page, *(one.aspage() for one in below)) if _is_picture(one)]
+        whole = [one for one in (page, *(one.aspage() for one in below)) if not int(one.subfiletype) & _NOT_WHOLE]
+        own = [one for one in whole if one.imagewidth > 0 and one.imagelength > 0]
         held[number] = sorted(own, key=_mean_side, reverse=True)
     side = max((_mean_side(page) for own in held.values() for page in own), default=0.0)
     full = {number: [page for page in own if _mean_side(page) > _FULL_SIZE * side] for number, own in held.items()}
@@ -239,12 +245,6 @@ def _full_pictures(file: TiffFile) -> dict[int, list[TiffPage]]:
 
 def _mean_side(page: TiffPage) -> float:
     return math.sqrt(page.imagewidth * page.imagelength)
-
-
-def _is_picture(page: TiffPage) -> bool:
-    """Whether it is neither a reduced picture nor a mask by its tags, and has pixels."""
-    is_reduced = int(page.subfiletype) & (_REDUCED_IMAGE | _TRANSPARENCY_MASK)
-    return not is_reduced and page.imagewidth > 0 and page.imagelength > 0
 
 
 def _band_notes(page: TiffPage, radiometry: Radiometry) -> tuple[str, ...]:
@@ -260,31 +260,20 @@ def _band_notes(page: TiffPage, radiometry: Radiometry) -> tuple[str, ...]:
 
 
 def _overviews(file: TiffFile, full: TiffPage, path: Path) -> tuple[Segments, ...]:
-    """The same picture made small, of the same form and samples: further pages, or below the page itself."""
+    """The same picture made small: further pages, or below the page itself, with the full picture's samples, and its
+    sides but for a factor and what is left of a pixel."""
     below = full.pages if full.subifds and full.pages is not None else ()
-    pages = [page.aspage() for page in (*file.pages, *below)]
-    small = [page for page in pages if int(page.subfiletype) & (_REDUCED_IMAGE | _TRANSPARENCY_MASK) == _REDUCED_IMAGE]
-    alike = [page for page in small if _is_overview(page, full)]
-    return tuple(TiffSegments(file, page, path, page_radiometry(page, path), 0.0) for page in alike)
-
-
-def _is_overview(page: TiffPage, full: TiffPage) -> bool:
-    """Whether it has the full picture's samples, and its sides but for a factor and what is left of a pixel."""
-    if (page.bitspersample, page.samplesperpixel) != (full.bitspersample, full.samplesperpixel):
-        return False
-    if page.photometric != full.photometric or page.imagewidth < 1 or page.imagelength < 1:
-        return False
-    factor = full.imagewidth / page.imagewidth
-    return factor > 1.5 and abs(full.imagelength / factor - page.imagelength) <= 1.5
-
-
-def _check_original(page: TiffPage, path: Path) -> None:
-    """Marks are measured where the scanner saw them: in a resampled frame the film is gone from their places, and the
-    noise from their standard deviations."""
-    if re.match(r'\s*\{"reseau": .*"pitch_mm": ', page.description):
-        raise MeasurementError(
-            f"{path}: is a frame that reseau has resampled, and no scan. Measure the scan that it was made of."
-        )
+    samples = full.bitspersample, full.samplesperpixel, full.photometric
+    small = list[TiffPage]()
+    for page in (page.aspage() for page in (*file.pages, *below)):
+        is_reduced = int(page.subfiletype) & _NOT_WHOLE == _REDUCED_IMAGE
+        if not is_reduced or (page.bitspersample, page.samplesperpixel, page.photometric) != samples:
+            continue
+        if page.imagewidth > 0 and page.imagelength > 0:
+            factor = full.imagewidth / page.imagewidth
+            if factor > 1.5 and abs(full.imagelength / factor - page.imagelength) <= 1.5:
+                small.append(page)
+    return tuple(TiffSegments(file, page, path, page_radiometry(page, path), 0.0) for page in small)
 
 
 def _check_sizes(page: TiffPage, path: Path, max_pixels: int | None) -> None:
@@ -338,17 +327,6 @@ def _check_extent(page: TiffPage, path: Path, taken: list[Extent]) -> None:
             )
 
 
-def _is_raw(page: TiffPage) -> bool:
-    """Rows stand one after the other, uncompressed."""
-    return (
-        page.is_contiguous
-        and not page.is_tiled
-        and page.predictor == 1
-        and page.fillorder == 1
-        and (page.planarconfig == 1 or page.samplesperpixel == 1)
-    )
-
-
 def _page_rounding_step_dn(file: TiffFile, page: TiffPage) -> float:
     """Of a page compressed as JPEG: its tables stand in a tag, or else at the beginning of every tile or strip."""
     if page.compression not in JPEG_COMPRESSIONS:
@@ -363,7 +341,7 @@ def _page_rounding_step_dn(file: TiffFile, page: TiffPage) -> float:
 
 def tiff_colour_tags(path: Path) -> ColourTags:
     """What the tags of a TIFF file's first page say of its tone curve. Raises one of DECODING_ERRORS."""
-    with tiff_file(path) as file:
+    with _tiff_file(path) as file:
         page = file.pages.first.aspage()
         profile, transfer = page.tags.valueof(_ICC_PROFILE), page.tags.valueof(_TRANSFER_FUNCTION)
         exif = exif_tags(page)
@@ -462,11 +440,12 @@ class TiffSegments(Segments):
         if self._is_float:
             with self._spanning:
                 if self._radiometry.span is None:
-                    self._radiometry = replace(self._radiometry, span=float_span(*self._stored_extremes()))
+                    self._radiometry = replace(self._radiometry, span=self._float_span())
         return self._radiometry.apply(stored)
 
-    def _stored_extremes(self) -> tuple[float, float]:
-        """The least and the greatest finite number of the picture; what cannot be decoded is passed over."""
+    def _float_span(self) -> tuple[float, float]:
+        """Floating-point numbers that map to 0 and full scale: the smallest usual scale that holds all finite ones of
+        the picture, else the extremes; what cannot be decoded is passed over."""
         extremes = list[float]()
         page = TiffSegments(self._file, self._page, self._path, self._radiometry, self.rounding_step_dn)
         rows, columns = page._grid
@@ -478,7 +457,9 @@ class TiffSegments(Segments):
                     stored = np.asarray(page._decode(index, None, height, width))[:height, :width]
                     finite = stored[..., : self.channels][np.isfinite(stored[..., : self.channels])]
                     extremes += [float(finite.min()), float(finite.max())] if finite.size else []
-        return min(extremes, default=0.0), max(extremes, default=1.0)
+        low, greatest = min(min(extremes, default=0.0), 0.0), max(extremes, default=1.0)
+        usual = (full for full in (1.0, 255.0, WORD_DN) if low == 0.0 and greatest <= full)
+        return low, next(usual, max(greatest, low + 1e-9))
 
     def _decode(self, index: int, given: bytes | None, height_px: int, width_px: int) -> NDArray[np.generic]:
         """(height, width, samples) of the stored numbers, height_px by width_px or more of them; a tile that was left
@@ -522,9 +503,10 @@ class TiffSegments(Segments):
             raise ValueError(f"it holds {samples.shape[1]} x {samples.shape[0]} px")
         return samples.reshape(*samples.shape[:2], self._samples)
 
-    def _decode_bytes(self, data: bytes | memoryview, height_px: int) -> NDArray[np.generic]:
-        """Of a tile or strip that holds rows of bytes. The last strip may be as tall as the others."""
-        page = self._page
+    def _decode_bytes(self, data: bytes | NDArray[np.uint8], height_px: int) -> NDArray[np.generic]:
+        """The numbers of a tile or strip that holds rows of bytes, each row from a byte of its own. The last strip may
+        be as tall as the others."""
+        page, shape = self._page, (-1, self.segment_width_px, self._samples)
         if page.fillorder == 2:
             data = bytes(imagecodecs.bitorder_decode(bytes(data)))
         full = self.segment_height_px * self._row_bytes
@@ -539,11 +521,6 @@ class TiffSegments(Segments):
         if len(stored) not in right:
             more = "more" if len(stored) > full else len(stored)
             raise ValueError(f"it holds {more} bytes, and should {right[-1]}")
-        return self._unpack(stored)
-
-    def _unpack(self, stored: NDArray[np.uint8]) -> NDArray[np.generic]:
-        """The numbers of whole rows, each of which begins with a byte of its own, as the machine has them."""
-        page, shape = self._page, (-1, self.segment_width_px, self._samples)
         if page.bitspersample in (8, 16):
             numbers = stored.view(self._stored_dtype).reshape(shape)
         else:
@@ -551,22 +528,17 @@ class TiffSegments(Segments):
             numbers = imagecodecs.packints_decode(bytes(stored), self._stored_dtype, page.bitspersample, runlen=run)
             numbers = numbers.reshape(shape)
         numbers = numbers.astype(page.dtype, copy=False)
-        if page.predictor == 1:
-            return np.asarray(numbers)
-        return np.asarray(TIFF.UNPREDICTORS[page.predictor](numbers, axis=-2))
+        return np.asarray(numbers if page.predictor == 1 else TIFF.UNPREDICTORS[page.predictor](numbers, axis=-2))
 
-    def _stored_bytes(self, index: int) -> bytes | memoryview:
+    def _stored_bytes(self, index: int) -> bytes | NDArray[np.uint8]:
         """A tile or strip as the file has it: mapped where it is so large that a copy would take long, for a mapping
         takes longer than the copy of a small one."""
         offset, size = self._page.dataoffsets[index], self._page.databytecounts[index]
         if self._address is not None:
             return self._address.ranges([(offset, offset + size)])[0]
-        if size > _MAPPED_BYTES:
-            before = offset % ALLOCATIONGRANULARITY
-            length = before + size
-            mapped = mmap(self._file.filehandle.fileno(), length, access=ACCESS_READ, offset=offset - before)
-            return memoryview(mapped)[before:]
         with self._reading:
+            if size > _MAPPED_BYTES:
+                return self._file.filehandle.memmap_array(np.uint8, (size,), offset)
             self._file.filehandle.seek(offset)
             return bytes(self._file.filehandle.read(size))
 
@@ -591,25 +563,22 @@ class RawRows(TiffSegments):
 
     def fill(self, samples: Samples, row0: int, col0: int) -> None:
         """Samples (height, width, channels) of the picture from a row and column on."""
-        rows = max(_MAPPED_BYTES // self._row_bytes, 1)
-        for first in range(0, len(samples), rows):
-            self._fill(samples[first : first + rows], row0 + first, col0)
+        at_a_time = max(_MAPPED_BYTES // self._row_bytes, 1)
+        for first in range(0, len(samples), at_a_time):
+            part, row = samples[first : first + at_a_time], row0 + first
+            rows = self._stored_rows(row, len(part))
+            part[:] = self._values(rows[:, col0 : col0 + part.shape[1]])
 
-    def _fill(self, samples: Samples, row0: int, col0: int) -> None:
-        height, width, _ = samples.shape
+    def _stored_rows(self, row0: int, height: int) -> NDArray[np.generic]:
+        """(height, width, samples) stored numbers from a row on. Of a local file they are mapped: only the pages of the
+        columns that are then taken are read, and none of them is held afterwards."""
         start = int(self._page.dataoffsets[0]) + row0 * self._row_bytes
         shape = (height, self.width_px, self._page.samplesperpixel)
         if self._address is not None:
             (data,) = self._address.ranges([(start, start + height * self._row_bytes)])
-            samples[:] = self._values(np.ndarray(shape, self._stored_dtype, data)[:, col0 : col0 + width])
-            return
-        before = start % ALLOCATIONGRANULARITY
-        size = before + height * self._row_bytes
+            return np.ndarray(shape, self._stored_dtype, data)
         try:
-            # Of the rows only the pages with these columns are read, and none of them is held afterwards.
-            with mmap(self._file.filehandle.fileno(), size, access=ACCESS_READ, offset=start - before) as mapped:
-                rows = np.ndarray(shape, self._stored_dtype, mapped, before)
-                samples[:] = self._values(rows[:, col0 : col0 + width])
-                del rows
+            with self._reading:
+                return self._file.filehandle.memmap_array(self._stored_dtype, shape, start)
         except (ValueError, OSError) as error:
             raise damage_error(self._path, f"rows {row0} to {row0 + height - 1} lie beyond its end") from error

@@ -70,27 +70,25 @@ class Block:
         return np.asarray(row * width + col + (corners - self.place_px) @ np.array([[1], [width]]))
 
     def reductions(self, factors: Iterable[int]) -> dict[int, Single]:
-        """Area averages of the grey values by each factor, computed from the coarsest finer one that divides it. Each
-        halving of stored samples rounds to whole grey values."""
+        """Area averages of the grey values by each factor, computed from the coarsest finer one that divides it.
+
+        Stored samples are halved as long as the factor is even, each time with rounded grey values: a quarter of the
+        time, and exact enough for a search.
+        """
         known: dict[int, Single] = {}
         for factor in sorted(factors):
             finer = [other for other in known if factor % other == 0]
             if finer:
                 known[factor] = means(known[finer[-1]][..., None], factor // finer[-1])[..., 0]
-            else:
-                known[factor] = weighted(_halved_means(self.samples, factor), self.scan.weights)
+                continue
+            samples, left = self.samples, factor
+            while left % 2 == 0:
+                height, width, channels = samples.shape
+                half = cv2.resize(samples, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+                samples = half.astype(samples.dtype, copy=False).reshape(height // 2, width // 2, channels)
+                left //= 2
+            known[factor] = weighted(samples if left == 1 else means(samples, left), self.scan.weights)
         return known
-
-
-def _halved_means(samples: Samples, factor: int) -> Samples | Single:
-    """(height / factor, width / factor, channels) means over squares. An even factor is taken by repeated halving, with
-    rounded grey values: a quarter of the time, and exact enough for a search."""
-    while factor % 2 == 0:
-        height, width, channels = samples.shape
-        half = cv2.resize(samples, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
-        samples = half.astype(samples.dtype, copy=False).reshape(height // 2, width // 2, channels)
-        factor //= 2
-    return samples if factor == 1 else means(samples, factor)
 
 
 def concatenate(first: Record, *others: Record) -> Record:
@@ -146,9 +144,6 @@ class Patches:
         return self.part(np.lexsort((*self.centers.T[::-1], -np.abs(self.contrasts))))
 
 
-PatchTest = Callable[[Block, Patches], Patches]
-
-
 @dataclass(frozen=True)
 class Octave:
     """Search in the scan reduced by a factor. margin: border of a part, reduced px; find: returns the patches of a
@@ -158,12 +153,10 @@ class Octave:
     margin: int
     find: Callable[[Single], Patches]
 
-    @property
-    def margin_px(self) -> int:
-        return self.margin * self.factor
 
-
-def search_blocks(scan: Scan, octaves: Sequence[Octave], test_patches: PatchTest | None = None) -> list[Candidate]:
+def search_blocks(
+    scan: Scan, octaves: Sequence[Octave], test_patches: Callable[[Block, Patches], Patches] | None = None
+) -> list[Candidate]:
     """Search all octaves of a scan in one pass over its blocks.
 
     Parameters
@@ -175,9 +168,8 @@ def search_blocks(scan: Scan, octaves: Sequence[Octave], test_patches: PatchTest
     Candidates in pixels of the scan, the strongest first, none within another.
     """
     unit = lcm(*(octave.factor for octave in octaves))
-    margin = _round_up(max(octave.margin_px for octave in octaves), unit)
+    margin = _round_up(max(octave.margin * octave.factor for octave in octaves), unit)
     width, height = _block_px(scan, unit, margin)
-
     rows, cols = height + 2 * margin, width + 2 * margin
     spare: list[Samples] = []  # reused: allocating memory for every block would take longer than the search
 

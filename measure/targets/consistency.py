@@ -242,8 +242,13 @@ def compare_images(images: Sequence[ImagePoints], xyz: Array) -> list[Comparison
     spread = np.full(3, _SPREAD * extent)  # standard deviations of the corrections to the points
     offs = np.zeros((len(images), *xyz.shape))  # corrections from all images but one
     covariances = np.zeros((*offs.shape, 3))
-    comparisons = _compare_all(images, offs, covariances)
-    for _ in range(_POINT_ROUNDS - 1):
+    for round_number in range(_POINT_ROUNDS):
+        comparisons = [
+            image.compare(off[image.index], covariance[image.index])
+            for image, off, covariance in zip(images, offs, covariances, strict=True)
+        ]
+        if round_number == _POINT_ROUNDS - 1:
+            break
         readings = _Readings.read(images, comparisons, offs)
         is_shared = (readings.squares > 0.0).sum(axis=0) > 1
         if not is_shared.any():
@@ -253,19 +258,10 @@ def compare_images(images: Sequence[ImagePoints], xyz: Array) -> list[Comparison
             off, covariance = readings.solve(weights, of_prior, spread)
             moments = of_prior[:, None] * (off**2 + np.einsum("nii->ni", covariance))
             spread = np.maximum(np.sqrt(moments[is_shared].mean(axis=0)), _LEAST * extent)
-        others = [
-            readings.leave_out(i).solve(np.delete(weights, i, axis=0), of_prior, spread) for i in range(len(weights))
-        ]
-        offs, covariances = (np.stack(parts) for parts in zip(*others, strict=True))
-        comparisons = _compare_all(images, offs, covariances)
+        for i in range(len(images)):
+            others = readings.leave_out(i)
+            offs[i], covariances[i] = others.solve(np.delete(weights, i, axis=0), of_prior, spread)
     return comparisons
-
-
-def _compare_all(images: Sequence[ImagePoints], offs: Array, covariances: Array) -> list[Comparison]:
-    return [
-        image.compare(off[image.index], covariance[image.index])
-        for image, off, covariance in zip(images, offs, covariances, strict=True)
-    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,8 +306,12 @@ class _Readings:
         ones = np.ones_like(self.squares)
         starts = [(ones * 1e-6, ones[0]), (ones, ones[0] * 1e-6)]
         ends = [self._reweight(*start, spread) for start in starts]
-        likely = np.array([self._log_likelihood(*end) for end in ends])
-        best = likely.argmax(axis=0)
+        likely = []  # log-likelihoods (m,) up to a constant
+        for far, of_off in ends:
+            by_image = -(STUDENT_FREEDOM + 2.0) / 2.0 * np.log1p(far / STUDENT_FREEDOM)
+            of_prior = (STUDENT_FREEDOM + 3.0) / 2.0 * np.log1p(of_off / STUDENT_FREEDOM)
+            likely.append(np.where(self.squares > 0.0, by_image, 0.0).sum(axis=0) - of_prior)
+        best = np.array(likely).argmax(axis=0)
         readings, priors = (np.stack([student_weights(end[k], 2.0 + k) for end in ends]) for k in (0, 1))
         which = np.arange(len(best))
         return readings[best, :, which].T, priors[best, which]
@@ -325,11 +325,6 @@ class _Readings:
             of_off = ((off / spread) ** 2).sum(axis=1)
             weights, of_prior = student_weights(far, 2.0), student_weights(of_off, 3.0)
         return far, of_off
-
-    def _log_likelihood(self, far: Array, of_off: Array) -> Array:
-        """(m,) log-likelihood up to a constant."""
-        readings = np.where(self.squares > 0.0, -(STUDENT_FREEDOM + 2.0) / 2.0 * np.log1p(far / STUDENT_FREEDOM), 0.0)
-        return np.asarray(readings.sum(axis=0) - (STUDENT_FREEDOM + 3.0) / 2.0 * np.log1p(of_off / STUDENT_FREEDOM))
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,16 +374,12 @@ def _predict_points(picture: SheetImage, view: SheetView, focal: float, sheet: A
     points, count = sheet[picture.index[known]], int(known.sum())
     by_point = view.pixel_from_space(points[:, :2], focal, _STEP * float(np.ptp(sheet[:, :2])))
     places = view.places_px(points[:, :2]) + by_point[..., 2] * points[:, 2:]
-    derivatives = _view_derivatives(places, picture.size_px)
+    # Shifts by one standard deviation of perspective and of decentring distortion.
+    size = float(np.hypot(*picture.size_px))
+    about = (2.0 * places - (np.array(picture.size_px) - 1.0)) / size
+    products = about[:, :, None] * about[:, None, :]
+    decentred = np.trace(products, axis1=1, axis2=2)[:, None, None] * np.eye(2) + 2.0 * products
+    derivatives = size * np.concatenate([_PERSPECTIVE * products, _DECENTRED * decentred], axis=2)
     targets = TargetPlaces(places, derivatives, np.zeros((count, 2, 2)), np.zeros(count, bool))
     observed = picture.observed_px[known], picture.covariance_px2[known]
     return ImagePoints(picture.index[known], targets, by_point, *observed, picture.size_px)
-
-
-def _view_derivatives(places: Array, size_px: tuple[int, int]) -> Array:
-    """(n, 2, 4) shift of places (n, 2) by one standard deviation of perspective and of decentring distortion."""
-    size = float(np.hypot(*size_px))
-    about = (2.0 * places - (np.array(size_px) - 1.0)) / size
-    products = about[:, :, None] * about[:, None, :]
-    decentred = np.trace(products, axis1=1, axis2=2)[:, None, None] * np.eye(2) + 2.0 * products
-    return np.asarray(size * np.concatenate([_PERSPECTIVE * products, _DECENTRED * decentred], axis=2))

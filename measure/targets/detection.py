@@ -85,9 +85,6 @@ class Outlines:
         return np.asarray(2.0 * np.maximum(np.linalg.det(self.moments), 0.0) ** 0.25)
 
 
-_NONE = Outlines(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0))
-
-
 def blob_outlines(image: Single, blobs: Blobs) -> Outlines:
     """Outlines of the light blobs that end on every ray; most structures of a landscape go on along some ray."""
     near, between = partial(_nearest_values, image), partial(_interpolated_values, image)
@@ -100,7 +97,7 @@ def blob_outlines(image: Single, blobs: Blobs) -> Outlines:
         for some in _chunks(alike, _RAYS * REACH * radius / 0.5):
             profiles = _Profiles(between, some, radius, _RAYS, 0.5)
             found.append(_outlines(some.places[profiles.ends], profiles))
-    return concatenate(_NONE, *found)
+    return concatenate(Outlines(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0)), *found)
 
 
 def _chunks(blobs: Blobs, samples: float) -> Iterator[Blobs]:
@@ -121,19 +118,11 @@ class _Profiles:
         self.values = sampled(blobs.places, along[:, None] * self.directions[:, None])
         core, around = (along <= _CORE * radius), (along >= _AROUND[0] * radius) & (along <= _AROUND[1] * radius)
         top, outer = self.values[core].mean(axis=(0, 1)), self.values[around].mean(axis=0)
-        self.ground = np.partition(outer, int(_GROUND_SHARE * rays), axis=0)[int(_GROUND_SHARE * rays)]
-        self.height = top - self.ground
-        self.level = (top + self.ground) / 2
+        ground = np.partition(outer, int(_GROUND_SHARE * rays), axis=0)[int(_GROUND_SHARE * rays)]
+        self.height = top - ground
+        self.level = (top + ground) / 2
         is_below = (self.values[1:].min(axis=0) < self.level).all(axis=0)
         self.ends = (self.values[0, 0] >= self.level) & is_below & (self.height >= _LEAST_HEIGHT * blobs.contrast)
-
-    def radii(self) -> Single:
-        """(rays, blobs that end) distance at which a ray falls below half the height, px."""
-        values, level = self.values[..., self.ends], self.level[self.ends]
-        last = (values < level).argmax(axis=0)[None] - 1
-        inner, outer = np.take_along_axis(values, last, axis=0)[0], np.take_along_axis(values, last + 1, axis=0)[0]
-        share = (inner - level) / np.maximum(inner - outer, np.float32(1e-9))
-        return np.asarray(self.step_px * (last[0] + np.clip(share, 0.0, 1.0)), np.float32)
 
 
 def _nearest_values(image: Single, places: NDArray[np.intp], offsets: Array) -> Single:
@@ -152,8 +141,14 @@ def _interpolated_values(image: Single, places: NDArray[np.intp], offsets: Array
 
 
 def _outlines(places: NDArray[np.intp], profiles: _Profiles) -> Outlines:
-    """Outlines of the patches that end: moments of the polygons through the ends of the rays, by Green's theorem."""
-    x, y = profiles.directions[..., None].astype(np.float32) * profiles.radii()
+    """Outlines of the patches that end: moments of the polygons through the places where the rays fall below half the
+    height, by Green's theorem."""
+    values, level = profiles.values[..., profiles.ends], profiles.level[profiles.ends]
+    last = (values < level).argmax(axis=0)[None] - 1
+    inner, outer = (np.take_along_axis(values, step, axis=0)[0] for step in (last, last + 1))
+    share = (inner - level) / np.maximum(inner - outer, np.float32(1e-9))
+    radii = np.asarray(profiles.step_px * (last[0] + np.clip(share, 0.0, 1.0)), np.float32)
+    x, y = profiles.directions[..., None].astype(np.float32) * radii
     x1, y1 = (np.roll(each, -1, axis=0) for each in (x, y))
     twice = x * y1 - x1 * y
     area = twice.sum(axis=0) / 2
@@ -200,12 +195,20 @@ def _patches(radii: list[float], search: DiskSearch, full_scale_dn: float, facto
     """Elliptical patches in a reduced image, within its margin."""
     small = np.ascontiguousarray(small)
     is_textured = small.size * factor**2 >= _TEXTURE_PX**2
-    noise = robust_scale(_fine_structure(small)) if is_textured else 0.0
-    found = []
+    noise = _white_noise(small) if is_textured else 0.0
+    found = [Patches.collect(())]
     for sign, own in _blobs(small, radii, search, full_scale_dn, is_textured):
         outlines = blob_outlines(small if sign > 0 else -small, own)
-        found.append(_elliptical_patches(outlines, noise, factor, sign))
-    return concatenate(Patches.collect(()), *found)
+        # Ellipses within the noise of their outlines. The least SNR refers to single pixels of the scan; means over
+        # factor² pixels raise it by the factor.
+        share = np.minimum(noise / np.maximum(outlines.height, 1e-9), 1 / (LEAST_SNR * factor))
+        worst = np.hypot(_WORST_MISFIT, _NOISE_SIGMAS * _EDGE_PX * share / outlines.radius)
+        ellipses = outlines.part(outlines.misfit < worst)
+        axes, directions = np.linalg.eigh(ellipses.moments)
+        shapes = directions * (2 * np.sqrt(np.maximum(axes, 0.0)))[:, None]
+        is_wide = axes[:, 0] >= _LEAST_FLAT * axes[:, 1]
+        found.append(Patches(ellipses.centers, shapes, sign * ellipses.height).part(is_wide))
+    return concatenate(*found)
 
 
 def _blobs(
@@ -240,26 +243,13 @@ def _blobs(
             yield sign, Blobs(np.stack([cols, rows], axis=1), radius, contrast)
 
 
-def _fine_structure(small: Single) -> Array:
-    """Samples of the image's second differences, scaled to the standard deviation of white noise (Immerkaer, 1996, Fast
-    noise variance estimation)."""
+def _white_noise(small: Single) -> float:
+    """Standard deviation of an image's white noise, from samples of its second differences (Immerkaer, 1996, Fast noise
+    variance estimation)."""
     above, row, below = (small[first : len(small) - 2 + first : _EVERY] for first in range(3))
     rows = above - 2 * row + below
     left, column, right = (rows[:, first : rows.shape[1] - 2 + first : _EVERY] for first in range(3))
-    return np.asarray((left - 2 * column + right) / 6, float)
-
-
-def _elliptical_patches(found: Outlines, noise: float, factor: int, sign: int) -> Patches:
-    """Outlines that are ellipses within their noise, as patches; sign: 1 for light ones, -1 for dark ones.
-
-    The least SNR refers to single pixels of the scan; means over factor² pixels raise it by the factor.
-    """
-    share = np.minimum(noise / np.maximum(found.height, 1e-9), 1 / (LEAST_SNR * factor))
-    kept = found.part(found.misfit < np.hypot(_WORST_MISFIT, _NOISE_SIGMAS * _EDGE_PX * share / found.radius))
-    axes, directions = np.linalg.eigh(kept.moments)
-    shapes = directions * (2 * np.sqrt(np.maximum(axes, 0.0)))[:, None]
-    is_wide = axes[:, 0] >= _LEAST_FLAT * axes[:, 1]
-    return Patches(kept.centers, shapes, sign * kept.height).part(is_wide)
+    return robust_scale(np.asarray((left - 2 * column + right) / 6, float))
 
 
 def disk_candidates(scan: Scan, search: DiskSearch) -> list[Candidate]:
@@ -269,29 +259,25 @@ def disk_candidates(scan: Scan, search: DiskSearch) -> list[Candidate]:
     -------
     Candidates to a tenth of a pixel or so, the strongest first, none within another.
     """
-    smallest, largest = search.diameter_px[0] / _SIZE_TOLERANCE, search.diameter_px[1] * _SIZE_TOLERANCE
+    smallest, largest = search.diameter_px[0] / 2, search.diameter_px[1] / 2
+    count = int(np.ceil(np.log(largest / smallest) / np.log(_SCALE_STEP))) + 1
+    by_factor: dict[int, list[float]] = {}  # radii, each reduced to a few pixels
+    for radius in np.geomspace(smallest, largest, count).tolist():
+        factor = max(1, int(2 ** np.floor(np.log2(max(radius / _SEARCH_RADIUS_PX, 1.0)))))
+        by_factor.setdefault(factor, []).append(radius / factor)
+    octaves = [
+        Octave(factor, _margin(radii), partial(_patches, radii, search, scan.full_scale_dn, factor))
+        for factor, radii in by_factor.items()
+    ]
 
     def disks(block: Block, patches: Patches) -> Patches:
         """Fitted disks whose axes agree with the stated diameters in an oblique view."""
         found = fit_disks(block, patches)
         longer, shorter = 2 * np.linalg.svd(found.shapes, compute_uv=False).T
-        return found.part((longer >= smallest) & (shorter <= largest))
+        is_right = longer >= search.diameter_px[0] / _SIZE_TOLERANCE
+        return found.part(is_right & (shorter <= search.diameter_px[1] * _SIZE_TOLERANCE))
 
-    return search_blocks(scan, disk_octaves(search, scan.full_scale_dn), disks)
-
-
-def disk_octaves(search: DiskSearch, full_scale_dn: float) -> list[Octave]:
-    """Octaves from the smallest radius to the largest, each reduced until its radii are a few pixels."""
-    smallest, largest = search.diameter_px[0] / 2, search.diameter_px[1] / 2
-    count = int(np.ceil(np.log(largest / smallest) / np.log(_SCALE_STEP))) + 1
-    by_factor: dict[int, list[float]] = {}
-    for radius in np.geomspace(smallest, largest, count).tolist():
-        factor = max(1, int(2 ** np.floor(np.log2(max(radius / _SEARCH_RADIUS_PX, 1.0)))))
-        by_factor.setdefault(factor, []).append(radius / factor)
-    return [
-        Octave(factor, _margin(radii), partial(_patches, radii, search, full_scale_dn, factor))
-        for factor, radii in by_factor.items()
-    ]
+    return search_blocks(scan, octaves, disks)
 
 
 @dataclass(frozen=True)
@@ -317,23 +303,19 @@ def cross_candidates(scan: Scan, search: CrossSearch) -> list[Candidate]:
     -------
     Candidates, the strongest first; the columns of pixel_from_disk are a cross's half bars.
     """
-    return search_blocks(scan, _cross_octaves(search, scan.full_scale_dn))
-
-
-def _cross_octaves(search: CrossSearch, full_scale_dn: float) -> list[Octave]:
-    """Octaves from the shortest half length to the longest, each reduced as far as the line width allows. Factors are
-    powers of two, since a block is a whole number of pixels in every octave."""
     octaves = []
     shortest, longest = search.half_px
     upper = 0.0
     while upper < longest:
         upper = min(shortest * _OCTAVE, longest)
+        # Reduced as far as the line width allows, and by a power of two: a block is a whole number of pixels in every
+        # octave.
         finest = max(min(shortest / _SEARCHED_ARM_PX, search.line * shortest / _THINNEST_PX), 1.0)
         factor = int(2 ** np.floor(np.log2(finest)))
         half, margin = (shortest / factor, upper / factor), int(np.ceil(2.0 * upper / factor + 4))
-        octaves.append(Octave(factor, margin, partial(_cross_patches, half, margin, search, full_scale_dn)))
+        octaves.append(Octave(factor, margin, partial(_cross_patches, half, margin, search, scan.full_scale_dn)))
         shortest = upper
-    return octaves
+    return search_blocks(scan, octaves)
 
 
 def _cross_patches(
@@ -401,7 +383,10 @@ def _fit_cross(patch: NDArray[np.floating], line: float) -> tuple[Array, Array] 
     if explained < _LEAST_EXPLAINED or others[second] == 0:
         return None
     bars = np.stack([_bar(off[on_bar[:, k]], units[:, k]) for k in (first, second)], axis=1)
-    filled = min(_filled(patch, center, bar) for bar in (*bars.T, *-bars.T))
+    arms = np.stack([*bars.T, *-bars.T])
+    places = np.round(center + np.linspace(0.0, 0.9, 12)[:, None, None] * arms).astype(int)
+    places = np.clip(places, 0, np.array(patch.shape[::-1]) - 1)
+    filled = (patch[places[..., 1], places[..., 0]] > 0.0).mean(axis=0).min()
     return (center, bars) if filled >= _LEAST_FILLED and abs(np.linalg.det(bars)) >= 1.0 else None
 
 
@@ -412,10 +397,3 @@ def _bar(off: Array, unit: Array) -> Array:
     direction = direction * (np.sign(direction @ unit) or 1.0)
     along = off @ direction
     return np.asarray(direction * (min(along.max(), -along.min()) + 0.5))
-
-
-def _filled(patch: NDArray[np.floating], center: Array, bar: Array) -> float:
-    """Fraction of an arm that the patch covers."""
-    places = np.round(center + np.linspace(0.0, 0.9, 12)[:, None] * bar).astype(int)
-    places = np.clip(places, 0, np.array(patch.shape[::-1]) - 1)
-    return float((patch[places[:, 1], places[:, 0]] > 0.0).mean())

@@ -6,7 +6,6 @@ takes the edge as straight within the blur, which changes the size by a few hund
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import ndtr
@@ -40,10 +39,11 @@ _FARTHEST, _MOST_GROWN = 0.5, float(np.log(1.5))  # change of centre in radii, o
 
 def fit_disks(block: Block, patches: Patches) -> Patches:
     """Patches that are disks, fitted, the strongest first; centres are right to a tenth of a pixel or so."""
-    first = np.full(len(patches.radii), _FIRST_BLUR_PX)
-    promising, blurs = _fit_patches(
-        block, patches, first, _strides(patches), _FIRST_STEPS_ROBUST, (_HOPELESS, _HOPELESS)
-    )
+    radius = patches.radii
+    first = np.full(len(radius), _FIRST_BLUR_PX)
+    of_edge = np.sqrt(8 * np.pi * radius / _EDGE_SAMPLES)
+    strides = np.maximum(np.minimum(radius / _COARSE_PX, of_edge), 1.0).astype(np.intp)
+    promising, blurs = _fit_patches(block, patches, first, strides, _FIRST_STEPS_ROBUST, (_HOPELESS, _HOPELESS))
     whole = np.ones(len(blurs), np.intp)
     return _fit_patches(block, promising, blurs, whole, (True,), (np.inf, 1.0))[0].strongest_first()
 
@@ -56,10 +56,10 @@ def _fit_patches(
     steps_robust: Sequence[bool],
     most_misfits: tuple[float, float],
 ) -> tuple[Patches, Array]:
-    """Fitted disks among the patches and their blurs (n,). strides (n,): spacing of the sampled pixels; most_misfits:
-    allowed before and after the steps."""
+    """Fitted disks among the patches and their blurs (n,). strides (n,): spacing of the sampled columns and rows, since
+    large disks need only part of their pixels; most_misfits: allowed before and after the steps."""
     found, blurs_found = [Patches.collect(())], [np.zeros(0)]
-    margins_px = _margins_px(patches)
+    margins_px = np.maximum(MARGIN * patches.radii, LEAST_MARGIN_PX)
     for group in _groups(patches, strides, margins_px):
         own, fit = group, _Fit(block, patches.part(group), blurs[group], strides[group], margins_px[group])
         is_promising = fit.misfit() < most_misfits[0]
@@ -104,17 +104,6 @@ def _groups(patches: Patches, strides: Indices, margins_px: Array) -> Iterator[I
         rest = rest[len(own) :]
 
 
-def _strides(patches: Patches) -> Indices:
-    """(n,) spacing of the sampled columns and rows: large disks need only part of their pixels."""
-    radius = patches.radii
-    of_edge = np.sqrt(8 * np.pi * radius / _EDGE_SAMPLES)
-    return np.maximum(np.minimum(radius / _COARSE_PX, of_edge), 1.0).astype(np.intp)
-
-
-def _margins_px(patches: Patches) -> Array:
-    return np.maximum(MARGIN * patches.radii, LEAST_MARGIN_PX)
-
-
 def _half_sides(patches: Patches, strides: Indices, margins_px: Array) -> Indices:
     """(n,) sampled pixels on either side of the window's centre."""
     longest = np.linalg.norm(patches.shapes, 2, axis=(1, 2))
@@ -148,9 +137,10 @@ class _Fit:
         self.middles, self.radius = middles, patches.radii
         self.centers, self.shapes = patches.centers - middles, patches.shapes
         self.blur = blurs
-        near = _Edges.from_fit(self).distance >= -margins_px[:, None]
+        edges = _Edges(self)
+        near = edges.distance >= -margins_px[:, None]
         self.used = near & (inside[:, 0, None] & inside[:, 1, :, None]).reshape(near.shape)
-        design = _Edges.from_fit(self).design(self)
+        design = edges.design(self)
         self.greys = gauss_newton_step(design[:, 6:], self.grey, self.used.astype(np.float32), _DAMPING)
         self.linearise(design)
 
@@ -161,7 +151,13 @@ class _Fit:
         self.design[:, :6] *= self.greys[:, :1, None].astype(np.float32)
         # A clipped grey value says nothing where the model lies beyond the end of the range as well.
         self.telling = self.used & (self.sides * self.residuals >= 0)
-        self.scale = _robust_scales_of_used(self.residuals, self.telling)
+        middle, count = self.telling.shape[1] // 2, self.telling.sum(axis=1)
+        # Other pixels are put below and above all of these in equal numbers, so that the median stays the median.
+        beyond = np.where(np.cumsum(~self.telling, axis=1) % 2, np.float32(np.inf), np.float32(-1))
+        off = np.where(self.telling, np.abs(self.residuals), beyond)
+        off.partition(middle, axis=1)
+        unbiased = np.sqrt(count / np.maximum(count - _UNKNOWNS, 1))
+        self.scale = np.asarray(SIGMA_OF_DEVIATION * np.where(count > 0, off[:, middle], np.inf) * unbiased, float)
 
     def step(self, is_robust: bool) -> None:
         """Take one Gauss-Newton step; a robust one down-weights dust and neighbours."""
@@ -174,7 +170,7 @@ class _Fit:
         self.shapes = self.shapes @ forms
         self.blur = np.clip(self.blur + np.clip(change[:, 5], -0.5 * self.blur, self.blur), *_BLUR_PX)
         self.greys = self.greys + change[:, 6:]
-        self.linearise(_Edges.from_fit(self).design(self))
+        self.linearise(_Edges(self).design(self))
 
     def _weights(self) -> Single:
         """(n, pixels), Tukey's."""
@@ -229,27 +225,20 @@ class _Fit:
         return np.asarray((self.misfit() < most_misfit) & (moved < _FARTHEST) & (grown < _MOST_GROWN) & same)
 
 
-@dataclass(frozen=True, eq=False)
 class _Edges:
     """Position of pixels (n, pixels) relative to their ellipse. radius: normalised, 1 on the ellipse; col, row:
     direction in the unit disk; px: length of a radius across the edge; distance: to the edge, px, positive inside."""
 
-    radius: Single
-    col: Single
-    row: Single
-    px: Single
-    distance: Single
-
-    @classmethod
-    def from_fit(cls, fit: _Fit) -> "_Edges":
+    def __init__(self, fit: _Fit) -> None:
         inverse = np.linalg.inv(fit.shapes).astype(np.float32)
         center = fit.centers.astype(np.float32)
         unit = inverse @ np.stack([fit.col - center[:, :1], fit.row - center[:, 1:]], axis=1)
-        radius = np.maximum(np.sqrt(unit[:, 0] ** 2 + unit[:, 1] ** 2), np.float32(1e-6))
-        direction = unit / radius[:, None]
+        self.radius: Single = np.maximum(np.sqrt(unit[:, 0] ** 2 + unit[:, 1] ** 2), np.float32(1e-6))
+        direction = unit / self.radius[:, None]
+        self.col, self.row = direction[:, 0], direction[:, 1]
         across = inverse.swapaxes(1, 2) @ direction
-        px = 1 / np.maximum(np.sqrt(across[:, 0] ** 2 + across[:, 1] ** 2), np.float32(1e-6))
-        return cls(radius, direction[:, 0], direction[:, 1], px, (1 - radius) * px)
+        self.px: Single = 1 / np.maximum(np.sqrt(across[:, 0] ** 2 + across[:, 1] ** 2), np.float32(1e-6))
+        self.distance = (1 - self.radius) * self.px
 
     def design(self, fit: _Fit) -> Single:
         """(n, unknowns, pixels) derivatives with respect to centre, size, stretch and shear (in units of the ellipse)
@@ -263,14 +252,3 @@ class _Edges:
         ellipse.append(2 * grown * self.col * self.row)
         greys = [-density * place, ndtr(place), np.ones_like(place), fit.col / size, fit.row / size]
         return np.stack([*ellipse, *greys], axis=1).astype(np.float32, copy=False)
-
-
-def _robust_scales_of_used(residuals: Single, used: Mask) -> Array:
-    """(n,) robust standard deviation of the used residuals."""
-    middle, count = used.shape[1] // 2, used.sum(axis=1)
-    # Unused pixels are put below and above all others in equal numbers, so that the median stays the median.
-    beyond = np.where(np.cumsum(~used, axis=1) % 2, np.float32(np.inf), np.float32(-1))
-    off = np.where(used, np.abs(residuals), beyond)
-    off.partition(middle, axis=1)
-    unbiased = np.sqrt(count / np.maximum(count - _UNKNOWNS, 1))
-    return np.asarray(SIGMA_OF_DEVIATION * np.where(count > 0, off[:, middle], np.inf) * unbiased, float)

@@ -98,11 +98,6 @@ class FittedDisk(MarkFit):
         return bool(self.is_fitted and self.damaged_fraction > _MOST_DAMAGE)
 
     @property
-    def contrast_sigma(self) -> float:
-        """Relative standard deviation of the contrast."""
-        return float(np.sqrt(self.appearance_covariance[3, 3]))
-
-    @property
     def dust_reason(self) -> Reason:
         """Why a disk that cannot be compared with others may be dust or a spot; empty if it is neither small nor
         soft."""
@@ -200,18 +195,14 @@ def fit_plain_disks(
     col0, row0 = np.floor(patches.centers.min(axis=0)).astype(int) - reach_px
     width, height = np.ceil(patches.centers.max(axis=0)).astype(int) + reach_px - (col0, row0)
     block = Block(scan, (int(col0), int(row0)), 0, scan.samples(int(col0), int(row0), int(width), int(height)))
-    placed = place_disks(block, patches, margins_px)
-    return [
-        _plain_disk(scan, disk) or fit_disk(scan, start.center_px, start.pixel_from_disk, margin_px)
-        for disk, start, margin_px in zip(placed, candidates, longest_margins_px, strict=True)
-    ]
-
-
-def _plain_disk(scan: Scan, fit: MarkFit) -> FittedDisk | None:
-    """The disk as a result; None if it is doubtful."""
-    disk = _assess(fit, covariance_of_compression(scan.rounding_step_dn, fit.contrast_dn))
-    stands_out = abs(disk.contrast_dn) > _PLAIN_SNR * disk.noise_dn
-    return disk if stands_out and not (disk.reason or disk.weakness or disk.dust_reason) else None
+    placed, disks = place_disks(block, patches, margins_px), []
+    for fit, start, margin_px in zip(placed, candidates, longest_margins_px, strict=True):
+        disk = _assess(fit, covariance_of_compression(scan.rounding_step_dn, fit.contrast_dn))
+        stands_out = abs(disk.contrast_dn) > _PLAIN_SNR * disk.noise_dn
+        if not stands_out or disk.reason or disk.weakness or disk.dust_reason:
+            disk = fit_disk(scan, start.center_px, start.pixel_from_disk, margin_px)
+        disks.append(disk)
+    return disks
 
 
 def _assess(fit: MarkFit, compression_px2: Array) -> FittedDisk:
@@ -223,8 +214,9 @@ def _assess(fit: MarkFit, compression_px2: Array) -> FittedDisk:
         return disk
     reason = weakness = NO_REASON
     contrast, (_, shorter) = abs(disk.contrast_dn), disk.half_axes_px
-    # White residuals are pure noise, which also disturbs the contrast: its upper bound decides.
-    most = contrast * (1 + min(_SURE * disk.contrast_sigma, _MOST_FAINTER)) if fit.covariance_is_white else contrast
+    most = contrast
+    if fit.covariance_is_white:  # pure noise, which also disturbs the contrast: its upper bound decides
+        most *= 1 + min(_SURE * float(np.sqrt(disk.appearance_covariance[3, 3])), _MOST_FAINTER)
     worst = WORST_SMOOTH_MISFIT if fit.neighbour_correlation > SMOOTH else WORST_MISFIT
     if not disk.is_fitted or most < LEAST_SNR * disk.noise_dn:
         message = f"no disk stands out: contrast {contrast:.0f}, noise {disk.noise_dn:.0f} grey values"
@@ -266,7 +258,13 @@ def dust_reasons(disks: Sequence[FittedDisk], predicted: Sequence[Array]) -> lis
         return [disk.dust_reason for disk in disks]
     appearances = np.array([_appearance(disk, shape) for disk, shape in zip(disks, predicted, strict=True)])
     noise = np.array([disk.appearance_covariance for disk in disks])
-    off, spread = _robust_deviations(appearances, np.einsum("nii->ni", noise))
+    variances = np.einsum("nii->ni", noise)
+    off = appearances - np.median(appearances, axis=0)
+    between = (SIGMA_OF_DEVIATION * np.median(np.abs(off), axis=0)) ** 2 - np.median(variances, axis=0)
+    spread = np.maximum(between, _LEAST_SPREAD)
+    spread[1:3] = spread[1:3].mean()  # stretch and shear have one
+    weights = (np.abs(off) < _OUTLYING * np.sqrt(spread + variances)) / (spread + variances)
+    off -= (weights * off).sum(axis=0) / weights.sum(axis=0)
     squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(noise + np.diag(spread)), off)
     return [
         _dust_reason(disk, own, float(square), len(disks))
@@ -296,17 +294,6 @@ def _dust_reason(disk: FittedDisk, off: Array, squares: float, count: int) -> Re
         )
         return Reason(message, Code.IMPRECISE)
     return NO_REASON
-
-
-def _robust_deviations(appearances: Array, noise: Array) -> tuple[Array, Array]:
-    """(n, figures) deviations of appearances from their robust mean, and (figures,) variance between targets: the
-    squared median absolute deviation minus noise, variances (n, figures). Stretch and shear share one variance."""
-    off = appearances - np.median(appearances, axis=0)
-    variance = (SIGMA_OF_DEVIATION * np.median(np.abs(off), axis=0)) ** 2 - np.median(noise, axis=0)
-    spread = np.maximum(variance, _LEAST_SPREAD)
-    spread[1:3] = spread[1:3].mean()
-    weights = (np.abs(off) < _OUTLYING * np.sqrt(spread + noise)) / (spread + noise)
-    return off - (weights * off).sum(axis=0) / weights.sum(axis=0), spread
 
 
 def _appearance(disk: FittedDisk, predicted: Array) -> Array:

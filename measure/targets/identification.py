@@ -126,22 +126,20 @@ def _measure_predicted(
     if len(set(names)) < len(names):
         twice = sorted({name for name in names if names.count(name) > 1})
         raise ValueError(f"{scan.name}: predicted twice: {', '.join(twice)}; each point is right once")
-    marks = {prediction.point: _unsearchable_mark(prediction, scan) for prediction in predictions}
+    marks, sought = dict[str, MarkMeasurement](), list[TargetPrediction]()
     # A disk near several predictions is fitted from the first: sort, so that the given order does not matter.
-    sought = sorted((one for one in predictions if marks[one.point] is None), key=lambda prediction: prediction.point)
-    found = {mark.point: mark for mark in _identified_marks(scan, sought, options, shape)}
-    return tuple(marks[name] or found[name] for name in names)
-
-
-def _unsearchable_mark(prediction: TargetPrediction, scan: Scan) -> MarkMeasurement | None:
-    """Mark of a target that cannot be searched for; None where it can."""
-    point, (col, row), shorter = prediction.point, prediction.center_px, prediction.half_axes_px[1]
-    if not (-0.5 <= col < scan.width_px - 0.5 and -0.5 <= row < scan.height_px - 0.5):
-        return MarkMeasurement(point, "target", None, None, Status.ABSENT, Reason("outside of the scan", Code.OUTSIDE))
-    if shorter < SMALLEST_RADIUS_PX:
-        reason = Reason(f"too small to be measured: half axis {shorter:.1f} px", Code.SMALL)
-        return _predicted_mark(prediction, reason)
-    return None
+    for prediction in sorted(predictions, key=lambda prediction: prediction.point):
+        point, (col, row), shorter = prediction.point, prediction.center_px, prediction.half_axes_px[1]
+        if not (-0.5 <= col < scan.width_px - 0.5 and -0.5 <= row < scan.height_px - 0.5):
+            reason = Reason("outside of the scan", Code.OUTSIDE)
+            marks[point] = MarkMeasurement(point, "target", None, None, Status.ABSENT, reason)
+        elif shorter < SMALLEST_RADIUS_PX:
+            reason = Reason(f"too small to be measured: half axis {shorter:.1f} px", Code.SMALL)
+            marks[point] = _predicted_mark(prediction, reason)
+        else:
+            sought.append(prediction)
+    marks |= {mark.point: mark for mark in _identified_marks(scan, sought, options, shape)}
+    return tuple(marks[name] for name in names)
 
 
 def _predicted_mark(prediction: TargetPrediction, reason: Reason) -> MarkMeasurement:

@@ -48,16 +48,14 @@ class RingCode:
     def published_numbers(self) -> tuple[int, ...]:
         """Numbers of DE 197 33 466 A1, ascending: an even number of set bits, two of them opposite each other. Other
         numbers are read as well."""
-        odd = range(1, 2**self.bits - 1, 2)
-        return tuple(number for number in odd if self._is_published(number) and self._is_least(number))
-
-    def _is_published(self, number: int) -> bool:
-        half = self.bits // 2
-        return number.bit_count() % 2 == 0 and bool(number & number >> half & 2**half - 1)
-
-    def _is_least(self, number: int) -> bool:
-        whole = 2**self.bits - 1
-        return all(number <= (number << turn & whole | number >> self.bits - turn) for turn in range(1, self.bits))
+        half, whole = self.bits // 2, 2**self.bits - 1
+        published = []
+        for number in range(1, whole, 2):
+            turns = (number << turn & whole | number >> self.bits - turn for turn in range(1, self.bits))
+            has_opposite_bits = number & number >> half & 2**half - 1
+            if number.bit_count() % 2 == 0 and has_opposite_bits and all(number <= turned for turned in turns):
+                published.append(number)
+        return tuple(published)
 
     def least_turn(self, number: int) -> int:
         """Smallest number over all rotations of a number's bits."""

@@ -6,7 +6,6 @@ from itertools import combinations, product
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
@@ -86,13 +85,6 @@ class SheetView:
         on_sheet = np.linalg.solve(moved[..., :2], moved[..., 2:])
         return np.concatenate([along, along @ on_sheet], axis=2)
 
-    def focal_terms(self) -> tuple[Array, Array]:
-        """(2,) a and b of a + b focal² = 0: the two axes of the sheet are orthogonal and of equal scale (Zhang
-        2000)."""
-        column, row = (self.homography[:, :2] / np.linalg.norm(self.homography[:, :2])).T
-        in_picture = np.array([column[:2] @ row[:2], column[:2] @ column[:2] - row[:2] @ row[:2]])
-        return in_picture, np.array([column[2] * row[2], column[2] ** 2 - row[2] ** 2])
-
     @property
     def _middle(self) -> Array:
         return (np.array(self.size_px) - 1.0) / 2.0
@@ -160,10 +152,17 @@ def fit_view_robustly(points: Array, observed_px: Array, size_px: tuple[int, int
 
 
 def focal_length(views: Sequence[SheetView]) -> float:
-    """Focal length common to the views, in half diagonals (Zhang 2000), by least squares."""
-    terms = [view.focal_terms() for view in views]
-    square = -sum(float(a @ b) for a, b in terms) / max(sum(float(b @ b) for _, b in terms), 1e-12)
-    return float(np.sqrt(square)) if square > 0.0 else _USUAL_FOCAL
+    """Focal length common to the views, in half diagonals, by least squares: the two axes of the sheet are orthogonal
+    and of equal scale, a + b focal² = 0 (Zhang 2000)."""
+    mixed, square = 0.0, 0.0
+    for view in views:
+        column, row = (view.homography[:, :2] / np.linalg.norm(view.homography[:, :2])).T
+        a = np.array([column[:2] @ row[:2], column[:2] @ column[:2] - row[:2] @ row[:2]])
+        b = np.array([column[2] * row[2], column[2] ** 2 - row[2] ** 2])
+        mixed += float(a @ b)
+        square += float(b @ b)
+    focal_square = -mixed / max(square, 1e-12)
+    return float(np.sqrt(focal_square)) if focal_square > 0.0 else _USUAL_FOCAL
 
 
 def homography_through(source: Array, target: Array) -> Array | None:
@@ -260,26 +259,19 @@ def _two_dot_points(sheet: Array, dots: Dots, first: int, second: int, hand: Arr
     steps = np.array([(0, 0), (1, 0), (0, 1), (-1, 0), (0, -1)], np.float64)
     along_px, observed_px = [], []
     for own, other in ((first, second), (second, first)):
-        axes = _right_handed(dots.pixel_from_disk[own])
+        shape = dots.pixel_from_disk[own]
+        axes = shape * np.array([1.0, np.sign(np.linalg.det(shape))])  # right-handed
         line_px = dots.centers_px[other] - dots.centers_px[own]
         on_disk = np.linalg.solve(axes, line_px)
-        turned = axes @ _rotation(hand @ (sheet[dots.coded[other]] - sheet[dots.coded[own]]), on_disk) @ hand
+        on_sheet = hand @ (sheet[dots.coded[other]] - sheet[dots.coded[own]])
+        angle = np.arctan2(on_disk[1], on_disk[0]) - np.arctan2(on_sheet[1], on_sheet[0])
+        rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         along_px.append(np.hypot(*line_px) / np.hypot(*on_disk))
-        observed_px.append(dots.centers_px[own] + steps @ turned.T)
+        observed_px.append(dots.centers_px[own] + steps @ (axes @ rotation @ hand).T)
     apart = np.hypot(*(sheet[dots.coded[second]] - sheet[dots.coded[first]]))
     radius = apart * np.sqrt(along_px[0] * along_px[1]) / np.hypot(*line_px)
     points = [sheet[dots.coded[own]] + radius * steps for own in (first, second)]
     return np.concatenate(points), np.concatenate(observed_px)
-
-
-def _right_handed(axes: Array) -> Array:
-    return np.asarray(axes * np.array([1.0, np.sign(np.linalg.det(axes))]))
-
-
-def _rotation(start: Array, end: Array) -> Array:
-    """Rotation matrix (2, 2) from one direction to another."""
-    angle = np.arctan2(end[1], end[0]) - np.arctan2(start[1], start[0])
-    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
 def _neighbourhood(sheet: Array, points: list[int]) -> Integers:
@@ -336,10 +328,13 @@ def _verify(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int])
     def is_alone(point: int) -> bool:
         return len(tree.query_ball_point(places[point], gate_px)) == 1
 
-    shapes = _predict_forms(view, sheet, dots, pairs)
+    measured = dots.pixel_from_disk[list(pairs.values())]
+    shapes = _predict_forms(view, sheet, points, measured)
     if shapes is None:
         return None
-    like = _have_form(dots.pixel_from_disk[list(pairs.values())], shapes[points])
+    like = _areas(shapes[points]) > 0.0
+    ratios = np.linalg.svd(np.linalg.solve(shapes[points][like], measured[like]), compute_uv=False)
+    like[like] = np.all((ratios < _SHAPE) & (ratios > 1.0 / _SHAPE), axis=1)
     named = {
         point: dot
         for (point, dot), distance, fits in zip(pairs.items(), np.hypot(*off.T), like, strict=True)
@@ -363,12 +358,12 @@ def _neighbour_residuals(sheet: Array, points: Integers, residuals: Array) -> Ar
     return np.asarray(np.nanmedian(of_neighbours, axis=1))
 
 
-def _predict_forms(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int, int]) -> Array | None:
-    """(n, 2, 2) predicted form of all dots, with their median radius on the sheet; None where the view has no
-    derivatives at any of them."""
+def _predict_forms(view: SheetView, sheet: Array, points: Integers, measured: Array) -> Array | None:
+    """(n, 2, 2) predicted form of all dots, with the median radius on the sheet of those measured at some points; None
+    where the view has no derivatives at any of them."""
     step = 0.01 * float(np.ptp(sheet, axis=0).max())
     unit = view.pixel_from_disks(sheet, step) / step
-    areas = _areas(dots.pixel_from_disk[list(pairs.values())]) / _areas(unit[list(pairs)])
+    areas = _areas(measured) / _areas(unit[points])
     if not np.isfinite(areas).any():
         return None
     return np.asarray(unit * np.sqrt(np.nanmedian(areas)))
@@ -377,11 +372,3 @@ def _predict_forms(view: SheetView, sheet: Array, dots: Dots, pairs: Mapping[int
 def _areas(shapes: Array) -> Array:
     """(n,) areas of parallelograms (n, 2, 2); nan where a shape is nan."""
     return np.asarray(np.abs(shapes[:, 0, 0] * shapes[:, 1, 1] - shapes[:, 0, 1] * shapes[:, 1, 0]))
-
-
-def _have_form(shapes: Array, expected: Array) -> NDArray[np.bool_]:
-    """(n,) whether ellipses (n, 2, 2) have the expected size and form."""
-    known = _areas(expected) > 0.0
-    radii = np.linalg.svd(np.linalg.solve(expected[known], shapes[known]), compute_uv=False)
-    known[known] = np.all((radii < _SHAPE) & (radii > 1.0 / _SHAPE), axis=1)
-    return known

@@ -114,7 +114,7 @@ def find_all_features(
     are_alike: the scans show one film, so that none is mirrored against another; what_fails: start of the reason that
     an unreadable scan gets.
     """
-    find = partial(_features_or_reason, count, are_alike, what_fails)
+    find = partial(_features, count, are_alike, what_fails)
     return map_or_replace(workers, find, frames, lambda _, why: unreachable(what_fails, why))
 
 
@@ -123,20 +123,17 @@ def unreachable(what_fails: str, why: str) -> Reason:
     return Reason(f"{what_fails}: {why}", Code.UNREACHABLE)
 
 
-def _features_or_reason(count: int, are_alike: bool, what_fails: str, frame: TieFrame) -> Features | Reason:
+def _features(count: int, are_alike: bool, what_fails: str, frame: TieFrame) -> Features | Reason:
+    """Features spread evenly over the scan, the strongest of each cell first."""
     try:
-        return _features(frame, count, frame.mirrored and not are_alike)
+        with frame.open() as scan:
+            size_px = scan.width_px, scan.height_px
+            factor = -(-max(size_px) // _LONGEST_PX)
+            grey = scan.reduced(factor)
     except MeasurementError as error:
         return unreachable(what_fails, str(error))
-
-
-def _features(frame: TieFrame, count: int, mirrored: bool) -> Features:
-    """Features spread evenly over the scan, the strongest of each cell first. mirrored: detect in the mirror image
-    (SIFT descriptors are invariant to rotation, not to reflection)."""
-    with frame.open() as scan:
-        size_px = scan.width_px, scan.height_px
-        factor = -(-max(size_px) // _LONGEST_PX)
-        grey = scan.reduced(factor)
+    # In the mirror image of a mirrored scan: SIFT descriptors are invariant to rotation, not to reflection.
+    mirrored = frame.mirrored and not are_alike
     black, white = np.percentile(grey[::4, ::4], _STRETCH)
     picture = np.clip((grey - black) * (255.0 / max(white - black, 1e-9)), 0.0, 255.0).astype(np.uint8)
     if mirrored:
@@ -163,8 +160,9 @@ def read_pieces(frame: TieFrame, patches: Sequence[tuple[Array, int]]) -> list[P
     return [pieces[k] for k in range(len(patches))]
 
 
-def shared_features(first: Features, second: Features) -> Indices:
+def shared_features(pair: tuple[Features, Features]) -> Indices:
     """(n, 2) indices of mutual nearest neighbours that pass the ratio test."""
+    first, second = pair
     if min(len(first.places_px), len(second.places_px)) < 2:
         return np.zeros((0, 2), np.intp)
     there, back = _nearest_features(first, second), _nearest_features(second, first)

@@ -223,47 +223,32 @@ def _correct_bending(points: Sequence[TiePoint]) -> list[TiePoint]:
             if piece.bending is not None and piece.unevenness >= POINT_REFUSED:
                 known[point.candidate.reference, frame].append(piece.bending)
     variances = {pair: bending_variance(bendings) for pair, bendings in known.items()}
-    nothing = np.zeros((6, 6))
-    return [
-        replace(
-            point,
-            matched={
-                frame: _correct_piece(piece, variances.get((point.candidate.reference, frame), nothing))
-                for frame, piece in point.matched.items()
-            },
-            refused={},
-        )
-        for point in points
-    ]
-
-
-def _correct_piece(piece: Matched, variance: Array) -> Matched:
-    if piece.bending is None:
-        return piece
-    shift, covariance = piece.bending.estimated(variance)
-    linear = piece.scan_from_patch[:, :2]
-    return replace(
-        piece,
-        center_px=piece.center_px - linear @ shift,
-        covariance_px2=piece.covariance_px2 + linear @ covariance @ linear.T,
-    )
+    corrected = []
+    for point in points:
+        matched = dict(point.matched)
+        for frame, piece in point.matched.items():
+            if piece.bending is None:
+                continue
+            variance = variances.get((point.candidate.reference, frame), np.zeros((6, 6)))
+            shift, covariance = piece.bending.estimated(variance)
+            linear = piece.scan_from_patch[:, :2]
+            matched[frame] = replace(
+                piece,
+                center_px=piece.center_px - linear @ shift,
+                covariance_px2=piece.covariance_px2 + linear @ covariance @ linear.T,
+            )
+        corrected.append(replace(point, matched=matched, refused={}))
+    return corrected
 
 
 def _test_points(frames: Sequence[TieFrame], points: Sequence[TiePoint]) -> None:
-    """Test each point against all others and note the reasons for refusal."""
+    """Test each point against all others and note the reasons for refusal: uneven, of a picture that differs from the
+    others unusually much for that frame, or contradicted by other frames."""
+    strangeness: dict[int, list[tuple[TiePoint, float]]] = defaultdict(list)
     for point in points:
         point.refused = {
             frame: _UNEVEN for frame in point.accepted_frames if point.matched[frame].unevenness < POINT_REFUSED
         }
-    _refuse_strange_pictures(points)
-    _refuse_contradictions(frames, points, partial(epipolar_outliers, tolerance=_FINE_PX), _OFF_LINES)
-    _refuse_contradictions(frames, points, neighbour_outliers, _UNLIKE_NEIGHBOURS)
-
-
-def _refuse_strange_pictures(points: Sequence[TiePoint]) -> None:
-    """Refuse a point in a frame whose image differs from the others unusually much for that frame."""
-    strangeness: dict[int, list[tuple[TiePoint, float]]] = defaultdict(list)
-    for point in points:
         for frame in point.accepted_frames:
             others = [point.matched[other].variance for other in point.accepted_frames if other != frame]
             if others:
@@ -274,6 +259,8 @@ def _refuse_strange_pictures(points: Sequence[TiePoint]) -> None:
         for point, value in rows:
             if value > limit:
                 point.refused[frame] = _OTHER_PICTURE
+    _refuse_contradictions(frames, points, partial(epipolar_outliers, tolerance=_FINE_PX), _OFF_LINES)
+    _refuse_contradictions(frames, points, neighbour_outliers, _UNLIKE_NEIGHBOURS)
 
 
 def _refuse_contradictions(

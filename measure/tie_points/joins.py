@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations, compress
 
 import cv2
@@ -27,7 +28,7 @@ from measure.tie_points.features import (
     read_pieces,
     shared_features,
 )
-from measure.tie_points.multi_image import RADIUS_PX, Matched, Piece, match_pieces
+from measure.tie_points.multi_image import RADIUS_PX, Matched, match_pieces
 from measure.tie_points.tracks import neighbour_outliers
 
 WANTED = 60  # joins per pair of scans
@@ -91,7 +92,11 @@ def measure_joins(parts: Sequence[TieFrame], wanted: int = WANTED, workers: Exec
             problems |= {part.image: _few_joins_problem(both, len(pairs), refused) for part in both}
     for image, own in marks.items():
         if not any(mark.status.is_observation for mark in own):
-            problems[image] = _no_joins_problem(agreements[image])
+            problems[image] = Reason(
+                f"Nothing joins it to the other scans of its frame: {'; '.join(agreements[image])}; at least {_FEWEST} "
+                "are needed. Check whether it is a scan of that frame, and whether the scans overlap.",
+                Code.FEW_TIES,
+            )
     problems |= {part.image: each for part, each in zip(parts, found, strict=True) if isinstance(each, Reason)}
     return Joins({image: tuple(own) for image, own in marks.items()}, problems)
 
@@ -99,7 +104,7 @@ def measure_joins(parts: Sequence[TieFrame], wanted: int = WANTED, workers: Exec
 def _match_features(first: Features, second: Features) -> tuple[Array | None, str]:
     """(2, 3) affine map of pixels from the first scan to the second, fitted to the inliers of one similarity, or None;
     and the number of inliers as a part of a sentence."""
-    pairs = shared_features(first, second)
+    pairs = shared_features((first, second))
     here, there = first.places_px[pairs[:, 0]], second.places_px[pairs[:, 1]]
     agree = np.zeros(len(pairs), dtype=bool)
     if len(pairs) >= _FEWEST:
@@ -146,7 +151,7 @@ def _measure_pair(
         pieces = list(zip(*read, strict=True))
     except MeasurementError as error:
         return [], Counter([str(error)])
-    matched = list(map_or_replace(workers, _match, pieces, lambda *_: (), _CHUNK))
+    matched = list(map_or_replace(workers, partial(match_pieces, reference=0), pieces, lambda *_: (), _CHUNK))
     reasons = [_refusal(pair) for pair in matched]
     good = [pair for pair, reason in zip(matched, reasons, strict=True) if not reason]
     if good:
@@ -154,10 +159,6 @@ def _measure_pair(
         good = list(compress(good, ~is_unlike))
         reasons += [_UNLIKE] * int(is_unlike.sum())
     return good[:wanted], Counter(str(reason) for reason in reasons if reason)
-
-
-def _match(pieces: tuple[Piece, Piece]) -> _MatchedPair:
-    return match_pieces(pieces, 0)
 
 
 def _refusal(pair: _MatchedPair) -> Reason:
@@ -187,14 +188,5 @@ def _few_joins_problem(both: tuple[TieFrame, TieFrame], found: int, refused: Cou
         f"Only {found} of {found + refused.total()} places join {both[0].image} and {both[1].image}{why}. Scans that "
         "overlap by more, of ground with texture, would have some tens; the standard deviations say what these are "
         "worth.",
-        Code.FEW_TIES,
-    )
-
-
-def _no_joins_problem(agreements: Sequence[str]) -> Reason:
-    """Problem of a scan without any join."""
-    return Reason(
-        f"Nothing joins it to the other scans of its frame: {'; '.join(agreements)}; at least {_FEWEST} are needed. "
-        "Check whether it is a scan of that frame, and whether the scans overlap.",
         Code.FEW_TIES,
     )

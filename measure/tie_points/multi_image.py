@@ -56,12 +56,6 @@ class Bending:
     noise: Array
     on_place: Array
 
-    @property
-    def has_noise(self) -> bool:
-        """Whether the noise covariance is regular; it is not for images copied from each other."""
-        values = np.linalg.eigvalsh(self.noise)
-        return bool(values[0] > _LEAST_NOISE_EIGENVALUE * values[-1])
-
     def estimated(self, variance: Array) -> tuple[Array, Array]:
         """Predicted shift (2,) of the position, px of the patch, and its remaining covariance (2, 2), given the
         covariance (6, 6) of bendings."""
@@ -90,15 +84,12 @@ def bending_variance(bendings: Sequence[Bending]) -> Array:
         normal = np.einsum("knij,lnji->kl", weighted, weighted)
         squares = np.einsum("ni,knij,nj->k", free, parts, free)
         expected = np.einsum("knij,nji->k", weighted, np.einsum("nij,njl->nil", inverse, noise))
-        components = _project_to_psd(np.linalg.solve(normal, squares - expected))
+        # Projected onto positive semidefinite covariances.
+        solved = np.linalg.solve(normal, squares - expected)
+        values, vectors = np.linalg.eigh(np.tensordot(solved, _DIRECTIONS, 1))
+        matrix = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        components = np.array([matrix[0, 0], matrix[0, 1], matrix[1, 1]])
     return np.asarray(np.tensordot(components, shapes, 1))
-
-
-def _project_to_psd(components: Array) -> Array:
-    """Project the components onto positive semidefinite covariances."""
-    values, vectors = np.linalg.eigh(np.tensordot(components, _DIRECTIONS, 1))
-    matrix = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return np.array([matrix[0, 0], matrix[0, 1], matrix[1, 1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,8 +165,13 @@ class _Fit:
         self.normal = np.eye(6)
 
     def run(self, smoothing_px: float) -> None:
-        """Iterate Gauss-Newton steps to convergence."""
-        self.splines = [_spline(piece.grey, smoothing_px) for piece in self.pieces]
+        """Iterate Gauss-Newton steps to convergence, on interpolating cubic splines of the smoothed grey values."""
+        self.splines = []
+        for piece in self.pieces:
+            picture = np.asarray(piece.grey, dtype=float)
+            if smoothing_px > 0.0:
+                picture = cv2.GaussianBlur(picture, (0, 0), smoothing_px)
+            self.splines.append(np.asarray(ndimage.spline_filter(picture, order=3, mode="mirror")))
         if gauss_newton(self, _STILL_PX, _ITERATIONS).reason == UNSETTLED:
             self.reasons = [Reason("the matching does not come to rest", Code.NO_FIT)] * len(self.pieces)
 
@@ -189,9 +185,15 @@ class _Fit:
         return np.asarray(np.linalg.solve(self.normal, self.design[:, self.used] @ differences.T).T)
 
     def step(self, step: Array) -> float:
-        """Apply affine corrections (frames, 6); returns the largest shift, px."""
-        for index, of_piece in enumerate(step):
-            self._move(index, of_piece)
+        """Apply affine corrections d(u) (frames, 6): patch coordinate u then maps to u - d(u). Returns the largest
+        shift, px."""
+        for index, own in enumerate(step):
+            if not np.isfinite(own).all() or np.hypot(*own[:2]) > _FARTHEST_STEP_PX or np.abs(own[2:]).max() > 0.5:
+                self.reasons[index] = Reason("the matching runs away from the approximate place", Code.NO_FIT)
+                continue
+            linear, shift = np.eye(2) - own[2:].reshape(2, 2), -own[:2]
+            before = self.maps[index]
+            self.maps[index] = np.column_stack([before[:, :2] @ linear, before[:, :2] @ shift + before[:, 2]])
         return float(np.abs(step[:, :2]).max())
 
     def failure(self) -> Reason:
@@ -218,7 +220,7 @@ class _Fit:
         The normal equations use products of different pieces: products of a piece with itself would count noise as
         texture, which slows convergence and makes the covariance too small.
         """
-        single = self._derivatives(self.values)
+        single = self._affine_derivatives()
         self.normal = _products(single, single)
         self.design[:, self.used] = single.mean(axis=0).T
         size = np.sqrt(np.abs(np.diag(self.normal)))
@@ -229,35 +231,28 @@ class _Fit:
             return False
         return True
 
-    def _derivatives(self, patches: Array) -> Array:
-        """(frames, pixels used, 6) affine derivatives of each patch, orthogonal to gain and offset."""
-        by_col, by_row = (_slope(patches, axis)[:, self.used] for axis in (2, 1))
+    def _slopes(self) -> list[Array]:
+        """(frames, pixels used) derivatives of the interpolating cubic splines of the pieces by column and by row."""
+        slopes = []
+        for axis in (2, 1):
+            coefficients = ndimage.spline_filter1d(self.values, order=3, axis=axis, mode="mirror")
+            slope = ndimage.correlate1d(coefficients, [-0.5, 0.0, 0.5], axis=axis, mode="mirror")
+            slopes.append(np.asarray(slope)[:, self.used])
+        return slopes
+
+    def _affine_derivatives(self) -> Array:
+        """(frames, pixels used, 6) derivatives of each piece by shift and linear part, orthogonal to gain and
+        offset."""
+        by_col, by_row = self._slopes()
         u, v = self.grid[self.used].T
         columns = [by_col, by_row, by_col * u, by_col * v, by_row * u, by_row * v]
-        return self._without_gain_and_offset(np.stack(columns, axis=2), patches)
+        return self._without_gain_and_offset(np.stack(columns, axis=2))
 
-    def _bending_derivatives(self, patches: Array) -> Array:
-        """(frames, pixels used, 6) derivatives by the coefficients of a bending, orthogonal to gain and offset."""
-        u, v = self.grid[self.used].T / RADIUS_PX
-        slopes = [_slope(patches, axis)[:, self.used] for axis in (2, 1)]
-        return self._without_gain_and_offset(
-            np.stack([slope * form for slope in slopes for form in (u * u, u * v, v * v)], 2), patches
-        )
-
-    def _without_gain_and_offset(self, design: Array, patches: Array) -> Array:
+    def _without_gain_and_offset(self, design: Array) -> Array:
         """Remove the components that a gain and an offset explain."""
-        patch = patches.mean(axis=0)[self.used]
+        patch = self.values.mean(axis=0)[self.used]
         grey = np.linalg.qr(np.stack([np.ones_like(patch), patch], axis=1))[0]
         return np.asarray(design - grey @ (grey.T @ design))
-
-    def _move(self, index: int, step: Array) -> None:
-        """Apply an affine correction d(u) to a piece: patch coordinate u then maps to u - d(u)."""
-        if not np.isfinite(step).all() or np.hypot(*step[:2]) > _FARTHEST_STEP_PX or np.abs(step[2:]).max() > 0.5:
-            self.reasons[index] = Reason("the matching runs away from the approximate place", Code.NO_FIT)
-            return
-        linear, shift = np.eye(2) - step[2:].reshape(2, 2), -step[:2]
-        before = self.maps[index]
-        self.maps[index] = np.column_stack([before[:, :2] @ linear, before[:, :2] @ shift + before[:, 2]])
 
     def unmatched(self) -> tuple[Matched, ...]:
         """Results without covariance, with the reasons of the pieces that failed."""
@@ -313,8 +308,11 @@ class _Fit:
         return np.asarray(inverse @ spread @ inverse)
 
     def _bendings(self, noises: Sequence[NoiseModel]) -> list[Bending | None]:
-        """Bending of each piece relative to the reference, after elimination of the affine parameters."""
-        single, bent = self._derivatives(self.values), self._bending_derivatives(self.values)
+        """Bending of each piece relative to the reference, after elimination of the affine parameters; None where its
+        noise covariance is singular, as for images copied from each other."""
+        u, v = self.grid[self.used].T / RADIUS_PX
+        columns_of_forms = [slope * form for slope in self._slopes() for form in (u * u, u * v, v * v)]
+        single, bent = self._affine_derivatives(), self._without_gain_and_offset(np.stack(columns_of_forms, axis=2))
         through = np.asarray(np.linalg.solve(self.normal, _products(single, bent)), np.float64)
         response = _products(bent, bent) - _products(single, bent).T @ through
         columns = np.zeros((bent.shape[2], *self.used.shape))
@@ -323,8 +321,10 @@ class _Fit:
         bendings: list[Bending | None] = []
         for values, spread in zip(self.values, spreads, strict=True):
             observed = np.tensordot(columns, values - self.values[self.reference], axes=2)
-            bending = Bending(observed, response, spread + spreads[self.reference], np.negative(through[:2]))
-            bendings.append(bending if bending.has_noise else None)
+            noise = spread + spreads[self.reference]
+            eigenvalues = np.linalg.eigvalsh(noise)
+            is_regular = eigenvalues[0] > _LEAST_NOISE_EIGENVALUE * eigenvalues[-1]
+            bendings.append(Bending(observed, response, noise, np.negative(through[:2])) if is_regular else None)
         bendings[self.reference] = None
         return bendings
 
@@ -353,17 +353,3 @@ def _products(first: Array, second: Array) -> Array:
     count = len(first)
     own = np.einsum("nij,nik->jk", first, second)
     return np.asarray((first.sum(axis=0).T @ second.sum(axis=0) - own) / (count * (count - 1)))
-
-
-def _spline(grey: NDArray[np.floating], smoothing_px: float) -> Array:
-    """Coefficients of the interpolating cubic spline of the smoothed grey values."""
-    picture = np.asarray(grey, dtype=float)
-    if smoothing_px > 0.0:
-        picture = cv2.GaussianBlur(picture, (0, 0), smoothing_px)
-    return np.asarray(ndimage.spline_filter(picture, order=3, mode="mirror"))
-
-
-def _slope(patches: Array, axis: int) -> Array:
-    """Derivative of the interpolating cubic spline of the patches along an axis."""
-    coefficients = ndimage.spline_filter1d(patches, order=3, axis=axis, mode="mirror")
-    return np.asarray(ndimage.correlate1d(coefficients, [-0.5, 0.0, 0.5], axis=axis, mode="mirror"))

@@ -54,16 +54,14 @@ class LocalMaps:
         self._trees = {pair: cKDTree(here) for pair, (here, _) in self._places.items()}
         self._whole = {pair: _affine_map(*places, np.zeros((2, 2)), 0.0) for pair, places in self._places.items()}
 
-    def linked_scans(self, start: int) -> list[int]:
-        """Scans that share features with this one."""
-        return sorted(end for begin, end in self._places if begin == start)
-
     def map(self, start: int, end: int, place_px: Array) -> Array | None:
-        """(2, 3) map of offsets from a place (2,) in one scan to places in another; None where the scales differ too
-        much.
+        """(2, 3) map of offsets from a place (2,) in one scan to places in another; None where they share no features,
+        or the scales differ too much.
 
         Fitted to the nearest matches, with the pair's global map as a prior.
         """
+        if (start, end) not in self._places:
+            return None
         here, there = self._places[start, end]
         near = np.atleast_1d(self._trees[start, end].query(place_px, min(_NEIGHBOURS, len(here)))[1])
         whole = self._whole[start, end][:, :2]
@@ -100,17 +98,13 @@ def verify_pairs(
     shared = {}
     both = [(i, j) for i, j in combinations(range(len(frames)), 2) if frames[i].frame != frames[j].frame]
     pairs_of = [(features[i], features[j]) for i, j in both]
-    found = map_or_replace(workers, _match_pair, pairs_of, lambda *_: np.zeros((0, 2), np.intp))
+    found = map_or_replace(workers, shared_features, pairs_of, lambda *_: np.zeros((0, 2), np.intp))
     for (i, j), pairs in zip(both, found, strict=True):
         first, second = (
             frames[k].camera_px(features[k].places_px[own]) for k, own in zip((i, j), pairs.T, strict=True)
         )
         shared[i, j] = pairs[epipolar_inliers(first, second, _AGREE_PX * features[i].reduction)]
     return shared
-
-
-def _match_pair(pair: tuple[Features, Features]) -> Indices:
-    return shared_features(*pair)
 
 
 def find_candidates(
@@ -124,16 +118,21 @@ def find_candidates(
     maps = LocalMaps(features, shared)
     found, cells, textures = [], [], []
     for track in tracks_of_pairs(shared):
-        reference = _most_central(frames, features, track)
+        # The reference has the point nearest to its axis: relative to it, the other views are least distorted.
+        _, reference = min(
+            (float(np.linalg.norm(frames[i].camera_px(features[i].places_px[k][None]))), i) for i, k in track.items()
+        )
         reached = _maps(frames, features, maps, track, reference)
         candidate = TieCandidate(reference, _one_per_exposure(frames, features, reached, reference))
         if len(candidate.maps) < fewest:
             continue
-        place = frames[reference].camera_px(candidate.maps[reference][None, :, 2])[0]
-        col, row = np.floor(place * _CELLS / _width_px(frames[reference], features[reference].size_px)).astype(int)
+        frame = frames[reference]
+        place = frame.camera_px(candidate.maps[reference][None, :, 2])[0]
+        size_px = max(features[reference].size_px) if frame.frame_mm is None else max(frame.frame_mm) * frame.px_per_mm
+        col, row = np.floor(place * _CELLS / size_px).astype(int)
         found.append(candidate)
         cells.append((reference * 1000 + col) * 1000 + row)
-        textures.append(min(features[frame].textures[feature] for frame, feature in track.items()))
+        textures.append(min(features[i].textures[feature] for i, feature in track.items()))
     return [found[k] for k in interleave_groups(np.array(cells, np.intp), np.array(textures))] if found else []
 
 
@@ -168,7 +167,7 @@ def _maps(
     """Maps (2, 3) by frame from the patch around the reference's feature to the feature, measured or predicted."""
     middle = features[reference].places_px[track[reference]]
     found = {reference: np.column_stack([np.eye(2), middle])}
-    for frame in maps.linked_scans(reference):
+    for frame in range(len(frames)):
         local = maps.map(reference, frame, middle)
         if local is None:
             continue
@@ -191,16 +190,6 @@ def _one_per_exposure(
     for i in maps:
         best[frames[i].frame] = max(best.get(frames[i].frame, i), i, key=inside.__getitem__)
     return {i: places for i, places in maps.items() if best[frames[i].frame] == i}
-
-
-def _width_px(frame: TieFrame, size_px: tuple[int, int]) -> float:
-    return float(max(size_px)) if frame.frame_mm is None else max(frame.frame_mm) * frame.px_per_mm
-
-
-def _most_central(frames: Sequence[TieFrame], features: Sequence[Features], track: Track) -> int:
-    """The frame with the point nearest to its axis: relative to it, the other views are least distorted."""
-    off = {i: np.linalg.norm(frames[i].camera_px(features[i].places_px[k][None])) for i, k in track.items()}
-    return min(off, key=lambda i: (off[i], i))
 
 
 def tracks_of_pairs(shared: Shared) -> list[Track]:
@@ -240,11 +229,11 @@ def tracks_of_pairs(shared: Shared) -> list[Track]:
 def epipolar_inliers(first: Array, second: Array, tolerance: float) -> Mask:
     """Mask of the pairs of points (n, 2) that satisfy one epipolar geometry within a tolerance, in the points' unit. No
     pair passes where there are too few inliers."""
+    nothing = np.zeros(len(first), dtype=bool)
     if len(first) < FEWEST_PAIRS:
-        return np.zeros(len(first), dtype=bool)
+        return nothing
     _, inside = cv2.findFundamentalMat(first, second, cv2.USAC_MAGSAC, tolerance, _CONFIDENCE, _TRIALS)
-    agree = np.zeros(len(first), dtype=bool) if inside is None else inside.ravel() > 0
-    return agree if agree.sum() >= FEWEST_PAIRS else np.zeros(len(first), dtype=bool)
+    return nothing if inside is None or np.count_nonzero(inside) < FEWEST_PAIRS else inside.ravel() > 0
 
 
 def epipolar_outliers(first: Array, second: Array, tolerance: float) -> Mask:

@@ -266,7 +266,7 @@ def test_a_worker_that_is_ended_over_a_place_costs_no_other_join(tmp_path: Path)
     lost = list[object]()
 
     def is_deadly(_: object, args: tuple[Any, ...]) -> bool:
-        matched = args[1] if getattr(args[0], "__name__", "") == "_match" else []
+        matched = args[1] if getattr(args[0], "func", None) is match_pieces else []
         lost[:] = lost or matched[:1]
         return any(each is lost[0] for each in matched)
 
