@@ -153,7 +153,6 @@ def _calibrated(
     run_measure(project, reporter, work)
     marks = read_comparator(project.comparator)
     left_out = _left_out(pictures, marks)
-    given_images = {camera.name: camera.images for camera in pictures.cameras}
     choices: dict[str, LensChoice | None] = {}
     adjustments, not_calibrated = dict[str, Adjustment](), dict[str, str]()
     with reporter.stage("calibrating") as count:
@@ -188,27 +187,22 @@ def _calibrated(
     project = write_project(out, replace(pictures, cameras=calibrated), options, lenses)
     summary = run_all(project, reporter, work)
     checks = read_check(project.check_path).cameras if project.check_path.exists() else {}
-    found = tuple(
-        camera_intrinsics(
-            adjustments[each.name],
-            each,
-            options.pixel_mm,
-            {
-                name: why
-                for name, why in {**left_out, **adjustments[each.name].left_out}.items()
-                if name in given_images[each.name]
-            },
-            choices[each.name],
-            options.pitch_um,
-            checks.get(each.name),
+    found = []
+    for each in calibrated:
+        adjustment, choice = adjustments[each.name], choices[each.name]
+        reasons = {**left_out, **adjustment.left_out}
+        own_reasons = {name: why for name, why in reasons.items() if name in each.images}
+        check = checks.get(each.name)
+        found.append(
+            camera_intrinsics(adjustment, each, options.pixel_mm, own_reasons, choice, options.pitch_um, check)
         )
-        for each in calibrated
-    )
     files = dict(camera_files(found, out, options.ros))
     for path, text in files.items():
         write_atomically(path, text)
     written = (*files, project.report_path, project.path)
-    return Calibration(found, pictures.unreadable, not_calibrated, written, summary, adjustments, options.pixel_mm)
+    return Calibration(
+        tuple(found), pictures.unreadable, not_calibrated, written, summary, adjustments, options.pixel_mm
+    )
 
 
 def _left_out(pictures: BoardPictureFiles, marks: Sequence[ComparatorPoint]) -> dict[str, str]:

@@ -51,7 +51,10 @@ def plot_sweep(swept: Swept, path: Path) -> None:
     shares = {name: _relative([step.sigmas.mean.get(name, math.nan) for step in swept.steps]) for name in swept.names}
     axes = _axes(swept, places, shares)
     curves = [_curve(axes, number, places, each) for number, each in enumerate(shares.values())]
-    key = [_key(axes, number, name) for number, name in enumerate(shares)]
+    key, x = [], axes.width - axes.right + 10.0
+    for number, name in enumerate(shares):
+        y = axes.top + ROW_PX * (number + 0.5)
+        key.append(_stroke(number, f"M{x:.1f} {y:.1f}h26") + svg.words(x + 32.0, y + 4.0, name, "tick"))
     chart = axes.grid(swept.quantity, "expected standard deviation, first value = 1")
     height = max(axes.height, axes.top + ROW_PX * (len(key) + 1))
     svg.write_picture(path, axes.width, height, f"Expected precision over {swept.quantity}", chart, *curves, *key)
@@ -90,11 +93,6 @@ def _curve(axes: svg.Axes, number: int, places: list[float], shares: list[float]
     color = COLORS[number % len(COLORS)]
     dots = [svg.tag("circle", cx=pixel[0], cy=pixel[1], r=2.5, fill=color) for pixel in pixels if pixel]
     return _stroke(number, path) + Markup("").join(dots)
-
-
-def _key(axes: svg.Axes, number: int, name: str) -> Markup:
-    x, y = axes.width - axes.right + 10.0, axes.top + ROW_PX * (number + 0.5)
-    return _stroke(number, f"M{x:.1f} {y:.1f}h26") + svg.words(x + 32.0, y + 4.0, name, "tick")
 
 
 def _stroke(number: int, path: str) -> Markup:
