@@ -174,10 +174,14 @@ class Frame:
         return self.options.gate_mm / float(self.pitch_mm.mean())
 
     @property
+    def largest_misfit_px(self) -> float:
+        """Largest deviation of a mark from its given place that is allowed in the search."""
+        return self.options.search_mm(self.layout) / float(self.pitch_mm.mean())
+
+    @property
     def first_search_px(self) -> float:
         """Search radius around a place predicted from the placement."""
-        largest_misfit_px = self.options.search_mm(self.layout) / float(self.pitch_mm.mean())
-        return REDUCED_PX * self.placement.reduction + largest_misfit_px
+        return REDUCED_PX * self.placement.reduction + self.largest_misfit_px
 
     @cached_property
     def predicted_px(self) -> Array:
@@ -463,8 +467,7 @@ def detect_missing_marks(frame: Frame) -> Frame:
     if frame.inliers.sum() >= 2 and not frame.is_certain_of_places:
         if len(frame.detections) > MANY:
             # If the frame itself is uncertain, the wide radius would turn texture into marks.
-            largest_misfit_px = frame.options.search_mm(frame.layout) / float(frame.pitch_mm.mean())
-            narrow_px = REDUCED_PX * frame.placement.reduction + NARROW * largest_misfit_px
+            narrow_px = REDUCED_PX * frame.placement.reduction + NARROW * frame.largest_misfit_px
             frame = detect_faint_marks(frame, narrow_px if frame.placement.surroundings.robust else frame.gate_px)
             # With such a search radius no mark is exempt from the outlier test.
             frame = replace(frame, certain=np.zeros_like(frame.certain))
