@@ -343,7 +343,7 @@ def fit_mark(window: Array, start: Array, steps: Array, alone: bool, rounding_st
         part = slice(row + outside, row + outside + side), slice(col + outside, col + outside + side)
         return ScanWindow(grey[part], (col, row), valid[part])
 
-    starts = [CornerStart(start, steps, np.array([6.0, 6.0]))]
+    starts = [CornerStart(start, steps, np.array([6.0, 6.0]), np.zeros(2))]
     return fit_corners(read, starts, quarter if alone else crossing, rounding_step_dn)[0]
 
 
