@@ -172,11 +172,12 @@ def test_edges_that_a_lens_bends_move_no_corner(kind: str) -> None:
     bent = flat - middle
     for _ in range(50):
         bent = (flat - middle) / (1 + k1 * (bent**2).sum(axis=1, keepdims=True))
-    truth = dict(zip(spec.object_points(), draw.mapped(np.linalg.inv(homography), bent), strict=True))
+    pixel_from_board = np.asarray(np.linalg.inv(homography), float)
+    truth = dict(zip(spec.object_points(), draw.mapped(pixel_from_board, bent), strict=True))
     board = measure_board(draw.make_scan(draw.take_picture(spec, homography, dark)), spec)
     errors = draw.errors_px(board, truth)
     assert len(errors) == len(flat)
-    away = list(truth.values()) - draw.mapped(np.linalg.inv(homography), np.zeros((1, 2)))
+    away = list(truth.values()) - draw.mapped(pixel_from_board, np.zeros((1, 2)))
     outward = np.sum(errors * away, axis=1) / np.hypot(*away.T)
     assert abs(outward.mean()) < 0.004
     assert np.sqrt(np.mean(errors**2)) < 0.012
