@@ -52,7 +52,9 @@ WORTH = 0.3  # fraction of the largest first-order decrease above which a hypoth
 STEPS = 40  # images of another pitch need about 20
 LEAST_SHARE = 0.05  # of v'Pv; further lens terms remove up to 0.02 on real boards
 TURNS = 8  # adjustments, each with the variance of the one before
-SPECIAL = ("drift", "groups")  # hypotheses that "distances" contains
+ENDING = ("groups", "distances", "affinities")  # after which nothing else is sought
+SHARED = ("radial", "decentering", "bow", "pixels", "shear", "drift", "jump", "groups", "distances", "board", "disks")
+GENERAL = {"distances": ("drift", "groups"), "affinities": SHARED}  # hypotheses on every image, and what is simpler
 FEWEST = 30  # coordinates needed to test the distribution of residuals
 CHANCE = 0.001  # significance level of each test of the noise hypothesis
 NEIGHBOURS = 8  # nearest neighbours searched for one in the same, or in another, image
@@ -101,7 +103,7 @@ def explain(
         last = alike[0]
         if len(alike) == 1 and last.kind == "groups":
             last = _with_separate_lenses(last) or last
-        if len(alike) > 1 or last.kind in ("groups", "distances"):
+        if len(alike) > 1 or last.kind in ENDING:
             break
     noises = (_added_noise(last.run, last.redundancy), _wide_control(last.run)) if last.exceeds(LEVEL) else ()
     for words, with_noise, widened in filter(None, noises):
@@ -242,18 +244,23 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
     if not found:
         return [], False
     variance = max(1.0, min(each.rest[0] / each.rest[1] for each in (model, *found)))
-    # A drift and groups of images stay, or a distance of each image's own if it explains significantly more.
-    pairs = [(one, other) for one, other in product(found, found) if one.kind == "distances" and other.kind in SPECIAL]
-    further = [(s.redundancy - g.redundancy, max(0.0, s.vpv - g.vpv) / variance) for g, s in pairs]
-    is_needless = any(chdtrc(count, fall) > LEVEL for count, fall in further)
-    dropped = ("distances",) if is_needless else SPECIAL if further else ()
-    found = [each for each in found if each.kind not in dropped]
+    for general, special in GENERAL.items():
+        found = _without_nested(found, variance, general, special)
     criteria = [each.criterion(variance) + each.costs for each in found]
     without = model.criterion(variance) - min(criteria) if model.gross_errors else np.inf
     if without < -TOLD_APART:
         return [], False
     alike = [each for each, own in zip(found, criteria, strict=True) if own < min(criteria) + TOLD_APART]
     return alike, bool(without < TOLD_APART)
+
+
+def _without_nested(found: list[_Model], variance: float, general: str, special: tuple[str, ...]) -> list[_Model]:
+    """Keep the special hypotheses, or one with unknowns for every image if it explains significantly more."""
+    pairs = [(one, other) for one, other in product(found, found) if one.kind == general and other.kind in special]
+    further = [(s.redundancy - g.redundancy, max(0.0, s.vpv - g.vpv) / variance) for g, s in pairs]
+    is_needless = any(chdtrc(count, fall) > LEVEL for count, fall in further)
+    dropped = (general,) if is_needless else special if further else ()
+    return [each for each in found if each.kind not in dropped]
 
 
 def _with_separate_lenses(model: _Model) -> _Model | None:

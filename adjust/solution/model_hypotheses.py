@@ -43,6 +43,7 @@ NONE = Selection()
 REFOCUSED = "Fix focus and zoom, switch autofocus and stabilisation off, and take the pictures again."
 RADIAL_DEGREES = (3, 5, 7, 9, 11, 13)  # powers of the radius, as of k1 to k6
 TERMS_TOGETHER = 2  # radial terms tested jointly
+MOST_MOVED = 60  # images that may have affinities of their own: cost grows with the square of their number
 FEWEST_DRIFTING = 4  # images that tell a drift from their scatter
 LEAST_CHANGE = 0.05  # of the distance
 NAMED = 5  # images named in a message, and points with their errors
@@ -100,7 +101,7 @@ def model_hypotheses(run: Run, is_suspicious: bool, is_fitted: bool) -> Iterator
     if not any(each.name.endswith(OTHERS) for each in network.cameras):
         of_cameras.append(_interior_orientations)
     if is_suspicious or is_fitted:
-        of_cameras.append(_jumps)
+        of_cameras += [_own_affinities, _jumps]
     yield from chain(*(kind(run, camera) for kind in of_cameras for camera in network.cameras if camera.name in used))
     yield from _scanner_pixels(run)
     if is_suspicious:
@@ -241,6 +242,40 @@ def _pixel_words(camera: str, per_mm: float) -> Words:
         )
 
     return words
+
+
+def _own_affinities(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
+    """An affinity of each digital image's own, as a camera or object that moves while rows are read gives it."""
+    problem, network = run.problem, run.problem.network
+    rows = problem.targets_by_camera[camera.name]
+    numbers, of_row = np.unique(problem.image_numbers[rows], return_inverse=True)
+    images = [network.images[number] for number in numbers]
+    if not FEWEST_IMAGES <= len(images) <= MOST_MOVED or any(image.transformation != "none" for image in images):
+        return
+    half_mm = max(network.extent_by_image[image.name].half_mm for image in images)
+    both = PolynomialTerms.from_terms(AFFINITY_TERMS).correction(
+        _from_principal_point(run, camera), np.zeros(2), np.zeros(2), half_mm
+    )
+    fields_mm = np.zeros((len(run.end.v_mm), len(images), 2, 2))
+    fields_mm[rows, of_row] = both.parameter_jacobian.swapaxes(1, 2)[rows]
+
+    def words(found: Estimate) -> tuple[str, str]:
+        sizes = np.hypot(*found.value.reshape(-1, 2).T) / half_mm
+        worst = shortened([images[k].name for k in np.argsort(-sizes, kind="stable")], NAMED)
+        return (
+            f"The images of camera {camera.name} are distorted each in its own way, stretched or sheared by up to "
+            f"{100.0 * sizes.max():.2g} % (largest first: {worst})",
+            "Look for motion of camera or object while a picture was taken (rolling shutter, long exposure) and for "
+            "stabilisation: fix both, give more light, and take the pictures again.",
+        )
+
+    found = _displaced_images(run, "affinities", "affinities", camera, words, fields_mm.reshape(len(fields_mm), -1, 2))
+    # Affinities of all images of a flat object leave the interior orientation open: it is held where it is.
+    unknowns = found.problem.unknowns
+    sigma = unknowns.sigma.copy()
+    interior = unknowns.camera[camera.name][: len(INTERIOR_NAMES)]
+    sigma[interior] = np.where(np.isinf(sigma[interior]), 0.0, sigma[interior])
+    yield replace(found, problem=replace(found.problem, unknowns=replace(unknowns, sigma=sigma)))
 
 
 def _drift(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:

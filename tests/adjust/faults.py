@@ -526,6 +526,7 @@ class Effects:
     side: float = 0.0
     jump: float = 0.0
     jumps: float = 0.0
+    motion: float = 0.0
     third: float = 0.0
     numbers_off: int = 0
     point: float = 0.0
@@ -654,6 +655,8 @@ def _projected(made: Scene, effects: Effects, kind: Misfit, image: int, rotation
     at[:, 1] += 0.7 * own * effects.crop
     jumped = effects.jumps + effects.jump * (image == int(np.argmax(made.groups)))
     at[:, 0] += jumped * (at[:, 1] > MIDDLE_MM[1] + 1.0)
+    moved = effects.motion * np.random.default_rng([len(points), image]).normal(size=2)
+    at += moved * ((at[:, 1:] - MIDDLE_MM[1]) / HALF_MM[1])
     if (effects.mirrored and image == int(np.argmax(made.groups))) or (effects.group_mirrored and own):
         at[:, 0] = 2.0 * MIDDLE_MM[0] - at[:, 0]
     return np.asarray(at * (1.0 + own * effects.scale))
@@ -764,6 +767,7 @@ MISFITS = {
         lambda e: Effects(side=0.1 * e), ("all on one side of a line",), size=3, fields=False
     ),
     "rows of an image jump": Misfit(lambda e: Effects(jump=0.01 * e), ("All marks of image im",), size=2),
+    "pictures moved": Misfit(lambda e: Effects(motion=0.01 * e), ("distorted each in its own way",), size=16),
     "rows of all images jump": Misfit(lambda e: Effects(jumps=0.01 * e), ("All marks of the images of",), size=2),
     "a quarter of the points elsewhere": Misfit(
         lambda e: Effects(third=2.0), ("points are not where they are given",), sized=False

@@ -29,6 +29,7 @@ QUICK = (
     "board bent over a diagonal",
     "focus drifts",
     "focus breathes with the distance",
+    "pictures moved",
     "rows of an image jump",
     "rows of all images jump",
     "a row of points shifted",
@@ -86,6 +87,13 @@ def test_a_jump_is_found_where_it_is() -> None:
     y_mm, by_um = (float(found.cause.split(a)[1].split(b)[0]) for a, b in ((" y = ", " mm"), ("(", ",")))
     assert y_mm == pytest.approx(faults.MIDDLE_MM[1] + 1.0, abs=0.1)
     assert by_um == pytest.approx(5.0, abs=1.0)
+
+
+@parametrize_with_studies("seed", [1, 2, 3, 4], quick=(1,))
+def test_an_estimated_noise_does_not_hide_pictures_that_moved(seed: int) -> None:
+    effects, rng = faults.Effects(motion=0.01), np.random.default_rng([seed, 1])
+    result = adjust_unmodelled(faults.misfit_network(faults.scene(seed, flat=True), effects, SOUND, rng))
+    assert [each.kind for each in result.explanations] == ["affinities"]
 
 
 @parametrize_with_studies("seed", [4, 5, 6, 7], quick=(0, 3))
