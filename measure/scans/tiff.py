@@ -448,6 +448,7 @@ class TiffSegments(Segments):
         the picture, else the extremes; what cannot be decoded is passed over."""
         extremes = list[float]()
         page = TiffSegments(self._file, self._page, self._path, self._radiometry, self.rounding_step_dn)
+        page._reading = self._reading  # both move the place in one file, in several threads
         rows, columns = page._grid
         for row, column in product(range(rows), range(columns)):
             height = min(page.segment_height_px, self.height_px - row * page.segment_height_px)

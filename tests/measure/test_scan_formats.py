@@ -4,6 +4,7 @@ import os
 import struct
 import zlib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
@@ -356,6 +357,24 @@ def test_floating_point_with_holes_and_negative_numbers(tmp_path: Path) -> None:
     assert grey[5, 5] == 0.0
     grey[5, 5] = (truth[5, 5] + 1) / 4 * 65535
     np.testing.assert_allclose(grey / 65535, (truth + 1) / 4, atol=2e-5)
+
+
+def test_the_scale_of_floating_point_is_found_while_other_threads_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truth = (picture() / picture().max() * 200.0).astype(np.float32)
+    tifffile.imwrite(tmp_path / "s.tif", truth, photometric="minisblack", rowsperstrip=HEIGHT // 2)
+    read = tifffile.FileHandle.read
+    with open_scan(tmp_path / "s.tif") as scan, ThreadPoolExecutor(1) as others:
+        rows: Any = scan._segments
+
+        def read_beside_another(file: tifffile.FileHandle, size: int = -1) -> bytes:
+            wait([others.submit(rows._stored_rows, 0, 1)], 0.05)
+            return read(file, size)
+
+        monkeypatch.setattr(tifffile.FileHandle, "read", read_beside_another)
+        grey = scan.window(0, 0, WIDTH, HEIGHT)
+    np.testing.assert_allclose(grey / 65535, truth / 255.0, atol=0.6 / 65535)
 
 
 @pytest.mark.parametrize("channels", [1, 3])
