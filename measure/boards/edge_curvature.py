@@ -54,5 +54,7 @@ def edge_curvatures(centers_px: Array, board: Array, normals: Array) -> Array:
         spare = count - np.where(is_cubic, 4, 3)
         squares_px2 = ((height - (design @ terms)[..., 0]) ** 2).sum(axis=1)
         lies_on_it = (spare > 0) & (squares_px2 <= _LARGEST_RESIDUAL_PX**2 * spare)
-        curvatures[known, edge] = np.where(lies_on_it, terms[:, 2, 0] / length[:, 0] ** 2, 0.0)
+        # A corner alone on its line does not show which edge that is: the other edge's curvature stays.
+        curved = terms[:, 2, 0] / length[:, 0] ** 2
+        curvatures[known, edge] = np.where(lies_on_it, curved, curvatures[known, edge])
     return curvatures

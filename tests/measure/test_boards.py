@@ -16,6 +16,7 @@ from studies import parametrize_with_studies
 
 from measure import Status, open_scan
 from measure.boards import specs
+from measure.boards.edge_curvature import edge_curvatures
 from measure.boards.find import is_even, whole_pattern
 from measure.boards.markers import ReadMarkers, charuco_board, find_aruco, find_charuco, off_corners
 from measure.boards.measure import BoardMeasurement, measure_board, one_definition
@@ -181,6 +182,21 @@ def test_edges_that_a_lens_bends_move_no_corner(kind: str) -> None:
     outward = np.sum(errors * away, axis=1) / np.hypot(*away.T)
     assert abs(outward.mean()) < 0.004
     assert np.sqrt(np.mean(errors**2)) < 0.012
+
+
+@pytest.mark.parametrize("edge", [0, 1])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_single_row_of_corners_shows_the_curvature_of_one_edge(axis: int, edge: int) -> None:
+    place = np.arange(-3.0, 4.0)
+    centers = np.stack([20.0 * place, 0.001 / 2 * (20.0 * place) ** 2], axis=1)
+    board = np.zeros((7, 2))
+    board[:, axis] = place
+    normals = np.zeros((7, 2, 2))
+    normals[:, edge] = (0.0, 1.0)
+    normals[:, 1 - edge] = (1.0, 0.0)
+    curvatures = edge_curvatures(centers, board, normals)
+    np.testing.assert_allclose(curvatures[3, edge], 0.001, rtol=1e-6)
+    np.testing.assert_array_equal(curvatures[:, 1 - edge], 0.0)
 
 
 LARGE = specs.ChessboardSpec(9, 6, 24.0)
