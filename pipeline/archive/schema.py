@@ -21,6 +21,7 @@ from pipeline.results.measured_record import MARK_COLUMNS
 STORE_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # damaged files: even SQLite's message may be undecodable
 APPLICATION = 0x52455345  # "RESE": identifies the file for `file` and this program
 MARKS = ", ".join(("number", *MARK_COLUMNS))
+
 _FIRST = """
 create table scan (
     id integer primary key,

@@ -104,8 +104,8 @@ class Work:
     def checked_result(self, scan: MeasuredScan) -> CheckedResult:
         """Result of a scan after the cross-scan checks, with all decisions applied."""
         name = scan.frame.image
-        decided = review_decisions.after_checks(scan, self.counting[name])
-        return CheckedResult(self.results[name], decided, self.decisions_hash(name))
+        checked = review_decisions.after_checks(scan, self.counting[name])
+        return CheckedResult(self.results[name], checked, self.decisions_hash(name))
 
     def keys(self) -> dict[str, str]:
         """{image: fingerprint of its last requested result}."""

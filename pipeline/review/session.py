@@ -293,9 +293,9 @@ class Session:
                 frames = tuple(zip(entry.images, entry.fingerprints, strict=True))
                 decisions = [replace(one, image=image, fingerprint=own) for one in decisions for image, own in frames]
             complete = [replace(one, who=self.who, when=when) for one in decisions]
-            for at, one in enumerate(complete):
+            for number, one in enumerate(complete):
                 if one.decision is decisions_file.Choice.LEARN:  # it applies to this file of the scan only
-                    complete[at] = replace(one, fingerprint=content_hash(self.project.scans[one.image]))
+                    complete[number] = replace(one, fingerprint=content_hash(self.project.scans[one.image]))
             decisions_file.append_decisions(self.project.decisions_path, complete)
             self.refresh()
 
