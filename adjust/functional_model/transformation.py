@@ -64,7 +64,7 @@ class FilmKind(ABC):
 
     @property
     def degree(self) -> int:
-        """Degree in the coordinates, of a fraction of its numerator and denominator."""
+        """Degree in the coordinates; of a fraction, which needs an `inverse` of its own, that of its parts."""
         return 1
 
     def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:

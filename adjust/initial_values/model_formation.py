@@ -376,18 +376,16 @@ def orient_free_model(sights: Mapping[str, Sight], known: Mapping[str, Array]) -
 def _models(sights: Mapping[str, Sight]) -> list[Block]:
     """Models of the pairs of images with most common points, one for each relative orientation, extended by all images
     that can be joined."""
-    common = {
-        pair: sorted(set(sights[pair[0]].points) & set(sights[pair[1]].points))
-        for pair in combinations(sorted(sights), 2)
-    }
-    enough = [pair for pair, points in common.items() if len(points) >= FEWEST_SHARED]
+    shown = {image: set(sights[image].points) for image in sorted(sights)}
+    counts = {pair: len(shown[pair[0]] & shown[pair[1]]) for pair in combinations(shown, 2)}
+    enough = [pair for pair, count in counts.items() if count >= FEWEST_SHARED]
     nothing = {name: np.full(3, np.nan) for sight in sights.values() for name in sight.points}
     models = []
-    for first, second in sorted(enough, key=lambda pair: (-len(common[pair]), pair))[:PAIRS]:
-        rays = []
+    for first, second in sorted(enough, key=lambda pair: (-counts[pair], pair))[:PAIRS]:
+        common, rays = sorted(shown[first] & shown[second]), list[Array]()
         for sight in (sights[first], sights[second]):
             row = {name: i for i, name in enumerate(sight.points)}
-            rays.append(sight.rays[[row[name] for name in common[first, second]]])
+            rays.append(sight.rays[[row[name] for name in common]])
         for pose in relative_poses(rays[0], rays[1], np.random.default_rng(0)):
             model = Block(sights, nothing, nothing, {first: Pose(np.eye(3), np.zeros(3)), second: pose})
             extend(model)

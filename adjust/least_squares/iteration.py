@@ -146,12 +146,7 @@ def iterate(
         history.append(Iteration(at.vpv, moved.sigmas, moved.damping, moved.attempts))
         if moved.damping == 0.0 and _stands_still(history):
             return Solution(at, at.factor, "converged", tuple(history))
-        lately = moved.damping or lately
-        if moved.damping == 0.0:
-            damping = 0.0 if moved.gain > POOR_GAIN else FIRST_DAMPING
-        else:  # smaller if the linear prediction was good, larger if it was not
-            damping = moved.damping * max(LARGEST_EASING, 1.0 - (2.0 * moved.gain - 1.0) ** 3)
-            damping = damping if damping > LEAST_DAMPING else 0.0
+        damping, lately = moved.next_damping, moved.damping or lately
     return Solution(at, at.factor, "iteration limit", tuple(history))
 
 
@@ -194,6 +189,14 @@ class _Moved:
     attempts: int
     solution: Array  # (n,) solution of the linear equations
     taken: Array  # (n,) the step taken: this solution, or the corrected or accelerated one
+
+    @property
+    def next_damping(self) -> float:
+        """Damping of the next step: smaller if the linear prediction was good, larger if it was not (Nielsen 1999)."""
+        if self.damping == 0.0:
+            return 0.0 if self.gain > POOR_GAIN else FIRST_DAMPING
+        eased = self.damping * max(LARGEST_EASING, 1.0 - (2.0 * self.gain - 1.0) ** 3)
+        return eased if eased > LEAST_DAMPING else 0.0
 
 
 def _step(

@@ -305,6 +305,8 @@ def blind_marks(problem: Problem, state: State) -> dict[str, tuple[str, str]]:
         _, found = lens.camera_from_image(shown.imaged)
         behind = rows[shown.in_camera[:, 2] >= 0.0]
         for number, row in enumerate([*behind, *rows[~found]]):
+            if images[row].name in blind:
+                continue
             why, check = "is where the distortion folds over", "the values from which the distortion starts"
             if number < len(behind):
                 why = "lies behind the camera"
@@ -313,7 +315,7 @@ def blind_marks(problem: Problem, state: State) -> dict[str, tuple[str, str]]:
             if images[row].exterior is None:
                 placed = "the number and the coordinates of the point"
             reason = f"point {observations.point[row]} {why} in image {images[row].name}"
-            blind.setdefault(images[row].name, (reason, f"Check {placed}, and {check}."))
+            blind[images[row].name] = reason, f"Check {placed}, and {check}."
     camera_xy = None if blind else _computed_in_camera(problem, state, targets)
     if camera_xy is not None:
         _, found = _computed_in_comparator(problem, state, camera_xy)

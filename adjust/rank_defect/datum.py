@@ -116,17 +116,17 @@ def centered(problem: Problem, state: State, members: Indices) -> State:
     """Transform the state by the free similarity that brings some coordinates nearest to their given values, and, as
     far as these leave it open, the others nearest to their approximate values."""
     given = problem.unknowns.given[members]
-    first = ~np.isnan(given)
-    wanted = np.where(first, given, problem.unknowns.start[members])
+    is_given = ~np.isnan(given)
+    wanted = np.where(is_given, given, problem.unknowns.start[members])
     for _ in range(CENTERINGS):
         datum = object_datum(problem, state, FLAT)
         motion, off = datum.motions(members), wanted - state.values[members]
-        stacked = np.vstack([motion[first], np.zeros((motion.shape[1], motion.shape[1]))])
+        stacked = np.vstack([motion[is_given], np.zeros((motion.shape[1], motion.shape[1]))])
         _, strength, right = np.linalg.svd(stacked, full_matrices=False)
         left_open = right[strength <= FLAT * strength.max(initial=0.0)].T
-        amount = np.linalg.lstsq(motion[first], off[first], rcond=FLAT)[0]
-        rest = off[~first] - motion[~first] @ amount
-        amount = amount + left_open @ np.linalg.lstsq(motion[~first] @ left_open, rest)[0]
+        amount = np.linalg.lstsq(motion[is_given], off[is_given], rcond=FLAT)[0]
+        rest = off[~is_given] - motion[~is_given] @ amount
+        amount = amount + left_open @ np.linalg.lstsq(motion[~is_given] @ left_open, rest)[0]
         state = _transformed(problem, state, datum, datum.free @ amount)
         if np.abs(amount).max(initial=0.0) <= EXACT * datum.extent:
             break
