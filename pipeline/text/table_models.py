@@ -78,11 +78,12 @@ def texts(value: Any) -> tuple[str, ...]:
 
 def known_name(value: Any, find: Callable[[str], object], names: Collection[str]) -> str:
     """Read a text for which `find` raises no ValueError. names: those that it may resemble. Raises ValueError."""
+    name = text(value)
     try:
-        find(text(value))
+        find(name)
     except ValueError as error:
-        raise ValueError(f"{error}.{did_you_mean(value, names)}") from None
-    return str(value)
+        raise ValueError(f"{error}.{did_you_mean(name, names)}") from None
+    return name
 
 
 def _path(value: Any) -> str:

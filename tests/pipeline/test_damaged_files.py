@@ -276,6 +276,7 @@ def set_status(first: str, others: str, columns: str) -> Changes:
         ("project.toml", setting('datum = "free"\ndatum_points = ["1", "P3"]'), ["P3", "not among the object points"]),
         ("project.toml", setting('datum = "minimal"\ndatum_coordinates = ["1X"]'), ["1X", "a dot and X, Y or Z"]),
         # film, weights, scanner, ties
+        ("project.toml", {'"affine"': "[5]"}, ["line 7: [adjust] transformation", "must be text in quotes, not [5]."]),
         ("project.toml", {'"affine"': '"afine"'}, ["line 7: [adjust] transformation", "Did you mean 'affine'?"]),
         ("project.toml", {'"affine"': '"polynomial"'}, ["lacks its order", 'as in "polynomial(2)"']),
         ("project.toml", {'"affine"': '"conformal(9)"'}, ["order must be from 1 to 5"]),

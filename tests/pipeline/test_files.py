@@ -163,6 +163,7 @@ def test_marks_are_turned_with_their_place_and_written_so(tmp_path: Path) -> Non
     [
         ('family = "torlegard"', 'famly = "torlegard"', ["line 9", "famly", "family"]),
         ('family = "torlegard"', 'family = "torlegaard"', ["line 9", "Did you mean 'torlegard'"]),
+        ('family = "torlegard"', "family = 5", ["line 9", 'must be text in quotes, not 5. Write family = "..."']),
         ('family = "torlegard"', 'family = "legendre(1)"', ["line 9", "the order of legendre must be 2 to 9, not 1"]),
         ("frame_mm = [228.0, 228.0]", "frame_mm = 228.0", ["frame_mm", "[x, y]"]),
         ("principal_distance_mm = 153.0", "principal_distance_mm = -153.0", ["greater than 0"]),
