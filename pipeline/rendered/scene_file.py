@@ -16,6 +16,7 @@ from pipeline.files.library import camera_path
 from pipeline.rendered.scene_project import Given, SceneFile, write_project
 from pipeline.rendered.scene_tables import DesignSettings, read_field
 from pipeline.text import table_models as models
+from pipeline.text.files import quote_value
 from pipeline.text.tables import Table, read_toml
 from synthetic_images import areas, scene
 from synthetic_images.render import Progress, render_scene
@@ -111,13 +112,20 @@ class ImageTable:
     part: tuple[float, float] = (0.0, 1.0)
 
 
+def _camera_given(value: Any) -> Any:
+    if not isinstance(value, str | Mapping):
+        wanted = "must be a table, [{table}], or the name of a camera's file in quotes"
+        raise ValueError(f"{wanted}, not {quote_value(value)}.")
+    return value
+
+
 @models.table_model
 class SceneTable:
     """SCENE.toml. camera: its table or the name of its file; writing: on all frames."""
 
     name: str | None = None
     seed: int = 1
-    camera: Annotated[str | Mapping[str, Any], models.Key("text or table", lambda value: value)]
+    camera: Annotated[str | Mapping[str, Any], models.Key("text or table", _camera_given)]
     field: models.Values
     film: FilmTable = FilmTable()
     scan: ScanTable

@@ -209,6 +209,12 @@ def test_a_scene_that_cannot_be_rendered_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nowhere\.toml: there is no such file"):
         read_scene(tmp_path / "nowhere.toml")
     bare = TEMPLATE[: TEMPLATE.index("[[field.grid]]")] + TEMPLATE[TEMPLATE.index("[picture]") :]
-    for text, words in ((TEMPLATE[:IMAGES], "at least one image"), (bare, "no target")):
+    demo = (SCENES / "demo.toml").read_text()
+    for text, words in (
+        (TEMPLATE[:IMAGES], "at least one image"),
+        (bare, "no target"),
+        (changed('"metric_camera.toml"', "5", demo), "line 5: camera: must be a table, .* quotes, not 5"),
+        (changed('"metric_camera.toml"', "[5]", demo), "line 5: camera: must be a table"),
+    ):
         with pytest.raises(InputError, match=words):
             read_scene(written(tmp_path, text))
