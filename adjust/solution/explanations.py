@@ -387,7 +387,7 @@ def _is_noise(run: Run) -> bool:
     present = freedom > 1.0
     variance = shares.sum() / freedom.sum()
     square = ((shares[present] / variance - freedom[present]) ** 2 / (2.0 * freedom[present])).sum()
-    if present.sum() >= 2 and chdtrc(present.sum() - 1, square) <= CHANCE:
+    if present.sum() >= 2 and not chdtrc(present.sum() - 1, square) > CHANCE:
         return False
     # Sums of products of residuals, of expectation 0 if independent, are not significantly positive.
     for products in _neighbour_products(run, checked, w, images):
