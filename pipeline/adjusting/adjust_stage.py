@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from adjust.functional_model.scanner import carriage_terms, smooth_terms
@@ -31,6 +30,7 @@ from pipeline.publishing import unpublished
 from pipeline.results.comparator_file import ComparatorPoint, has_pixels_alone, read_comparator
 from pipeline.results.record_json import write_record
 from pipeline.results.stage_files import choice_content
+from pipeline.terminal import uncut_table
 from pipeline.text.wording import listed
 from pipeline.types import Array
 
@@ -233,7 +233,7 @@ def run_choose(project: Project, reporter: Reporter) -> tuple[Choice, dict[str, 
 def print_choice(choice: Choice, console: Console, path: Path) -> None:
     """Print a table of the candidates, the verdict and the reasons."""
     columns = ("model", "unknowns", "redundancy", "sigma0", "v'Pv", "AIC", "AICc", "left out, µm", "correlated")
-    table = Table(*columns, title="Candidates", title_justify="left")
+    table = uncut_table(columns, "Candidates")
     for each in choice.candidates:
         predicted = each.cross_validation
         numbers = (

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from adjust.functional_model.families import family as family_of
@@ -23,6 +22,7 @@ from pipeline.results.adjustment_file import observed_mm, read_adjustment, read_
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.record_json import write_record
 from pipeline.results.stage_files import DRIFT, ComparisonRecord, ParameterDifference, comparison_record
+from pipeline.terminal import uncut_table
 from pipeline.text.files import check_writable
 from pipeline.text.wording import did_you_mean, listed
 from pipeline.types import Array
@@ -173,7 +173,7 @@ def _print_difference(
     first, *others = (each.name for each in comparison.calibrations)
     columns = ("parameter", first, others[k], "difference", "sigma", "in joint sigmas", "unit")
     family = family_of(comparison.calibrations[0].lens.distortion.family)
-    table = Table(*columns, title=f"{others[k]} less {first}", title_justify="left")
+    table = uncut_table(columns, f"{others[k]} less {first}")
     for row in parameters:
         if np.isnan(row.sigmas) and row.difference == 0.0:
             continue

@@ -131,7 +131,7 @@ class NewProject:
             are_all = len(mute) == len(self.named)
             sets = "sets it" if are_all else "is that of all scans: to set it, give these a project of their own"
             yield (
-                f"{scans} scans do not say their resolution ({mute[0].head.pitch.note}): the marks' separations "
+                f"{counted(scans, 'scan')} without a resolution ({mute[0].head.pitch.note}): the marks' separations "
                 f"tell it{spacing_text}; pitch_um in the project {sets}."
             )
         plates = sorted({number for group in self.named for number in group.numbers})

@@ -51,9 +51,7 @@ def resample(
     same = [*(("--pitch-um", f"{pitch_um:g}") if pitch_um else ()), *(("--lens",) if lens else ())]
     shared.print_next(
         as_json,
-        shared.command_step(
-            "export", project, "micmac", "DIR", *same, why="or metashape, ...: cameras of these frames"
-        ),
+        shared.command_step("export", project, "opencv", "DIR", *same, why="or colmap, asp: cameras of these frames"),
     )
     return shared.LOOK if any(result.problem or result.doubt for result in results) else shared.DONE
 
@@ -147,7 +145,10 @@ def convert(
     done = run_convert(file, out_dir, ConvertOptions(family, r0_mm, named, camera))
     files = f"{out_dir}: {counted(len(done.files), 'file')}"
     shared.show(as_json, done.as_json, lambda _: shared.say(*done.lines(), files))
-    shared.print_next(as_json, f'camera = "{out_dir / "camera.toml"}" in project.toml, then reseau run')
+    line = f'camera = "{out_dir / "camera.toml"}"'
+    if "camera.toml" not in done.files:
+        line = f'calibration = "{out_dir / "adjustment.json"}" under [sigma]'
+    shared.print_next(as_json, f"{line} in project.toml, then reseau run")
     return shared.LOOK if done.misfit_um > misfit_um else shared.DONE
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from markupsafe import Markup
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from adjust.problem.parameter import Parameter, description
@@ -18,6 +17,7 @@ from pipeline.drawing import svg
 from pipeline.progress import Reporter
 from pipeline.report.numbers import NONE, fixed, significant, value_and_sigma
 from pipeline.results.record_json import write_record
+from pipeline.terminal import uncut_table
 from pipeline.text.files import check_writable
 
 WIDE_RANGE = 2.0  # ratio of the largest to the smallest value, from which the axis is logarithmic
@@ -120,7 +120,7 @@ def print_design(design: Design, console: Console) -> None:
     for warning in adjustment.warnings:
         console.print(Text(f"- {warning}"))
     for title, heads, rows in (*_tables(design), *map(_sweep_table, design.swept)):
-        table = Table(*heads, title=title, title_justify="left")
+        table = uncut_table(heads, title)
         for row in rows:
             if row[0] == SLOPE:
                 table.add_section()

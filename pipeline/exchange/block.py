@@ -208,9 +208,11 @@ class Block:
     def needs_orientation(self, format: str) -> None:
         """Raise InputError where no image is oriented."""
         if not any(self.oriented()):
+            path = self.project.adjustment_path
+            has = f"{path} has none" if path.exists() else f"there is no {path}"
             raise InputError(
-                f"{format} is for oriented images, and {self.project.adjustment_path} has none. Run `reseau adjust` "
-                "first, with object points that the images show, or `reseau block`."
+                f"{format} is for oriented images, and {has}. Run `reseau adjust` first, with object points that the "
+                "images show, or `reseau block`."
             )
 
 

@@ -33,7 +33,7 @@ from pipeline.commands.shared import command_step, print_next, summary_steps
 from pipeline.progress import Reporter, time_left
 from pipeline.report.verdict import ReportVerdict
 from pipeline.summary import Summary
-from pipeline.terminal import PlainConsole
+from pipeline.terminal import PlainConsole, uncut_table
 from pipeline.text.wording import count_sentence
 
 
@@ -264,6 +264,15 @@ def test_steps_counts_and_times_are_printed_in_one_form(capsys: Capture) -> None
     assert count_sentence("measured", 1, 1, {}) == "1 of 1 scan measured"
     left = [time_left(seconds).removeprefix("about ") for seconds in (0.2, 110.0, 3000.0, 9000.0)]
     assert left == ["a minute left", "2 minutes left", "50 minutes left", "2.5 hours left"]
+
+
+def test_no_figure_of_a_table_is_cut_where_the_terminal_is_narrow() -> None:
+    text = io.StringIO()
+    table = uncut_table([f"figure {k}" for k in range(9)], "Candidates")
+    table.add_row(*["123456789.5"] * 9)
+    PlainConsole(file=text, width=80).print(table)
+    assert "…" not in text.getvalue()
+    assert sum(letter in "123456789.5" for letter in text.getvalue().split("┡")[1]) == 9 * 11
 
 
 def lines(quiet: bool = False, terminal: bool = False) -> list[str]:
