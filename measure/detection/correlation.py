@@ -28,7 +28,7 @@ class Surroundings:
     Attributes
     ----------
     coarse : in widths of the mark's finest detail; coarser structure is background.
-    beside : in the same unit, distance around the drawing up to which pixels are used.
+    margin : in the same unit, distance around the drawing up to which pixels are used.
     robust : local contrast by a median, which is insensitive to edges far stronger than the mark, instead of a mean
         square, which takes less of the noise for contrast.
     whitened : weight the template by the inverse covariance of neighbouring pixels. Grain hides the coarse structure of
@@ -36,7 +36,7 @@ class Surroundings:
     """
 
     coarse: float
-    beside: float
+    margin: float
     robust: bool
     whitened: bool
 
@@ -70,7 +70,7 @@ class Surroundings:
             drawn = np.nan_to_num(np.abs(template - np.nanmedian(rim)))
             # A line far thinner than a pixel has almost no contrast left.
             background = (drawn < min(_DRAWN, float(drawn.max()) / 2)).astype(np.uint8)
-            about &= cv2.distanceTransform(background, cv2.DIST_L2, 5) <= self.beside * detail_px + 1
+            about &= cv2.distanceTransform(background, cv2.DIST_L2, 5) <= self.margin * detail_px + 1
         mask = np.asarray(about, np.float32)
         template = np.nan_to_num(template)
         chip = np.asarray(template - cv2.GaussianBlur(template, (0, 0), self.coarse * detail_px), np.float32)
@@ -110,8 +110,8 @@ def correlation(image: Map, chip: Map, about: Map, varied: Map | None = None) ->
     return np.asarray(products, np.float32)
 
 
-WIDE = Surroundings(coarse=4.0, beside=2.0, robust=False, whitened=False)
-CLOSE = Surroundings(coarse=2.0, beside=1.0, robust=True, whitened=False)  # for faint marks near the frame's edge
+WIDE = Surroundings(coarse=4.0, margin=2.0, robust=False, whitened=False)
+CLOSE = Surroundings(coarse=2.0, margin=1.0, robust=True, whitened=False)  # for faint marks near the frame's edge
 GRAINY = replace(CLOSE, whitened=True)  # for such marks in grain as wide as their lines
 
 

@@ -368,11 +368,11 @@ def test_the_scale_of_floating_point_is_found_while_other_threads_read(
     with open_scan(tmp_path / "s.tif") as scan, ThreadPoolExecutor(1) as others:
         rows: Any = scan._segments
 
-        def read_beside_another(file: tifffile.FileHandle, size: int = -1) -> bytes:
+        def read_among_others(file: tifffile.FileHandle, size: int = -1) -> bytes:
             wait([others.submit(rows._stored_rows, 0, 1)], 0.05)
             return read(file, size)
 
-        monkeypatch.setattr(tifffile.FileHandle, "read", read_beside_another)
+        monkeypatch.setattr(tifffile.FileHandle, "read", read_among_others)
         grey = scan.window(0, 0, WIDTH, HEIGHT)
     np.testing.assert_allclose(grey / 65535, truth / 255.0, atol=0.6 / 65535)
 
