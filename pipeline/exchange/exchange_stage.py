@@ -188,5 +188,8 @@ def _cameras(cameras: Sequence[CameraFile]) -> dict[str, str]:
         name = "camera.toml" if len(cameras) == 1 else f"{file_word(camera.name or 'camera')}.toml"
         text = camera_text(replace(camera, path=Path(name)), lambda *_: "")
         if files.setdefault(name, text) != text:
-            raise InputError(f"two cameras of the name {camera.name!r} differ. Import them one by one.")
+            raise InputError(
+                f"two cameras of the name {camera.name!r} differ, as those of rectified frames do, which have sizes of "
+                "their own. Import them one by one, each into its own folder."
+            )
     return files
