@@ -13,6 +13,7 @@ from pipeline.commands import adjusting, exchanging, measuring
 from pipeline.commands.shared import DONE, INTERNAL_ERROR, INTERRUPTED, LOOK, WRONG_INPUT
 from pipeline.errors import InputError, what_to_do, what_to_do_about_store
 from pipeline.terminal import plain, spell_out_missing_letters
+from pipeline.text.files import quote_value
 
 __all__ = ["DONE", "INTERNAL_ERROR", "INTERRUPTED", "LOOK", "WRONG_INPUT", "app", "run"]
 
@@ -78,7 +79,9 @@ def run(arguments: Sequence[str] | None = None) -> int:
             return _message(message, INTERRUPTED)
         return code if isinstance(code, int) else DONE
     except typer.TyperException as error:
-        message, context = error.format_message().replace("Value error, ", ""), getattr(error, "ctx", None)
+        if isinstance(error, typer.BadParameter):
+            error.message = _wrong_value(error)
+        message, context = error.format_message(), getattr(error, "ctx", None)
         if message.startswith("Missing") and context is not None and context.parent is not None:
             message += f" `reseau {context.info_name} --help` shows what it takes."
         return _message(message, WRONG_INPUT)
@@ -118,6 +121,24 @@ def root(
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
         raise typer.Exit
+
+
+def _wrong_value(error: typer.BadParameter) -> str:
+    """What the value of an option or argument must be, in the words of the messages on tables."""
+    from pydantic import ValidationError
+
+    if not isinstance(error.__cause__, ValidationError):
+        return error.message
+    first = error.__cause__.errors(include_url=False)[0]
+    kind, limits = first["type"], first.get("ctx", {})
+    if kind == "greater_than_equal":
+        return f"must be at least {limits['ge']:g}, not {first['input']}."
+    if kind == "less_than_equal":
+        return f"must be at most {limits['le']:g}, not {first['input']}."
+    if kind.startswith(("float", "int")):
+        expected = "a number" if kind.startswith("float") else "a whole number"
+        return f"must be {expected}, not {quote_value(first['input'])}."
+    return first["msg"].removeprefix("Value error, ")
 
 
 def _message(text: str, code: int) -> int:

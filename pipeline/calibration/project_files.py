@@ -19,7 +19,7 @@ from pipeline.files.project_file import ASSUMED_PITCH_UM, Project, read_project
 from pipeline.files.target_table import TARGET_TABLES, BoardTable
 from pipeline.results.image_unit import CENTRE
 from pipeline.text.csv_table import csv_line
-from pipeline.text.files import write_atomically
+from pipeline.text.files import make_folder, write_atomically
 from pipeline.text.wording import did_you_mean, quoted, table_lines
 
 BoardKind = Literal["chessboard", "charuco", "aprilgrid", "aruco", "circle-grid", "asymmetric-circle-grid"]
@@ -168,7 +168,7 @@ def write_project(
     out: Path, pictures: BoardPictureFiles, options: CalibrationOptions, lenses: Mapping[str, LensModel]
 ) -> Project:
     """Write project.toml, a camera file for each camera, and images.csv where images differ; then read the project."""
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     for camera in pictures.cameras:
         write_atomically(out / f"{camera.name}.toml", _camera_text(camera, options, lenses[camera.name]))
     has_lines = len(pictures.cameras) > 1 or any(camera.turned_deg for camera in pictures.cameras)

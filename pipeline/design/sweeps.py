@@ -47,8 +47,9 @@ class Variations:
     @staticmethod
     def read(path: Path) -> "Variations":
         """Read a scene file. Raises InputError."""
-        values = copy.deepcopy(dict(read_toml(path).values))
-        values.setdefault("scan", {}).setdefault("pitch_um", PLANNING_PITCH_UM)
+        values = copy.deepcopy(dict(read_toml(path, "scene.toml").values))
+        if "field" in values:  # otherwise it is no scene, and is refused with the keys that it has
+            values.setdefault("scan", {}).setdefault("pitch_um", PLANNING_PITCH_UM)
         return Variations(path, values)
 
     def setup(self, layout: int = 0) -> Setup:

@@ -164,7 +164,7 @@ class CameraFile:
 
 def read_camera(path: FilePath) -> CameraFile:
     """Read camera.toml. Raises InputError with file, line and key."""
-    return parse_camera(read_toml(path))
+    return parse_camera(read_toml(path, "camera.toml"))
 
 
 def parse_camera(table: Table) -> CameraFile:

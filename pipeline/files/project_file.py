@@ -247,7 +247,7 @@ def read_project(path: FilePath) -> Project:
 
     Raises InputError with file, line and key; errors in the project file itself are reported first.
     """
-    return _read_tables(read_toml(path))
+    return _read_tables(read_toml(path, "project.toml"))
 
 
 def read_undrawn(path: Path, scans: Sequence[Path] = ()) -> Project:
@@ -257,7 +257,7 @@ def read_undrawn(path: Path, scans: Sequence[Path] = ()) -> Project:
     `read_project` does.
     """
     if not scans:
-        given = read_toml(path).values
+        given = read_toml(path, "project.toml").values
         return _read_tables(Table({"camera": _UNDRAWN, **given}, path, ""), needs_camera=False)
     names = [glob.escape(os.path.relpath(scan, path.parent)) for scan in scans]
     return _read_tables(Table({"camera": _UNDRAWN, "scans": names}, path, ""), needs_camera=False)

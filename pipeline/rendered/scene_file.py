@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, ClassVar, cast
 
 import numpy as np
 from pydantic import Field
@@ -16,7 +16,7 @@ from pipeline.files.library import camera_path
 from pipeline.rendered.scene_project import Given, SceneFile, write_project
 from pipeline.rendered.scene_tables import DesignSettings, read_field
 from pipeline.text import table_models as models
-from pipeline.text.files import quote_value
+from pipeline.text.files import make_folder, quote_value
 from pipeline.text.tables import Table, read_toml
 from synthetic_images import areas, scene
 from synthetic_images.render import Progress, render_scene
@@ -37,6 +37,7 @@ def render_project(scene_path: Path, out_dir: Path, progress: Progress | None = 
             f"{out_dir}: holds {' and '.join(own)}, which would be overwritten, and nothing says that they were "
             "rendered. Name another folder."
         )
+    make_folder(out_dir)
     try:
         render_scene(scene_file.scene, out_dir, progress)
     except OSError as error:
@@ -48,7 +49,7 @@ def render_project(scene_path: Path, out_dir: Path, progress: Progress | None = 
 
 def read_scene(path: Path) -> SceneFile:
     """Read SCENE.toml. Raises InputError with file, line and key."""
-    return parse_scene(read_toml(path))
+    return parse_scene(read_toml(path, "scene.toml"))
 
 
 @models.table_model
@@ -122,6 +123,8 @@ def _camera_given(value: Any) -> Any:
 @models.table_model
 class SceneTable:
     """SCENE.toml. camera: its table or the name of its file; writing: on all frames."""
+
+    file_kind: ClassVar[str] = "scene file (`reseau template scene` prints one)"
 
     name: str | None = None
     seed: int = 1

@@ -408,6 +408,7 @@ class AdjustmentRecord:
     cameras, scanners, boards, images, frames, points : by name; frames are those scanned in parts.
     """
 
+    file_name: ClassVar[str] = "adjustment.json"
     reseau: str
     made_from: Mapping[str, str] = field(default_factory=dict)
     converged: Flag

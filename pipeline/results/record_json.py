@@ -21,7 +21,9 @@ import pydantic
 from adjust.problem.parameter import Parameter, parameter_from_text
 from pipeline.errors import InputError
 from pipeline.text.files import parse_json, quote_value, read_bytes, write_atomically
-from pipeline.text.table_models import name_in_file
+from pipeline.text.table_models import MANY_KEYS, name_in_file
+from pipeline.text.tables import list_words
+from pipeline.text.wording import LISTED
 
 Record = TypeVar("Record")
 _AT_A_TIME = 10_000  # JSON tokens written at once
@@ -147,7 +149,15 @@ def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
         return record
     except pydantic.ValidationError as error:
         parse_json(data, path)  # raises for a file that is no JSON
-        place, problem = _place_and_problem(kind, error.errors(include_url=False)[0])
+        errors = error.errors(include_url=False)
+        lacked = [each["loc"][0] for each in errors if each["type"] == "missing" and len(each["loc"]) == 1]
+        needed = getattr(kind, "file_name", path.name)
+        if path.name != needed and len(lacked) > MANY_KEYS:
+            keys = list_words(lacked[:LISTED])
+            raise InputError(
+                f"{path}: is a file of another kind: it lacks the keys {keys}. Name the {needed} that is meant."
+            ) from None
+        place, problem = _place_and_problem(kind, errors[0])
         raise InputError(f"{path}: {place or 'the file'} {problem}. {remedy}") from None
 
 

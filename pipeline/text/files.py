@@ -122,6 +122,12 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         os.fsync(file.fileno())
 
 
+def make_folder(folder: Path) -> None:
+    """Create a folder, with those above it, if it does not exist. Raises WriteError."""
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+
+
 def check_writable(folder: Path) -> None:
     """Check before a long computation that its results can be written. Raises WriteError if not."""
     with _temporary_file(folder / f".writable.{os.getpid()}.part", folder) as temporary:

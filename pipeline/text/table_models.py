@@ -39,7 +39,7 @@ Model = TypeVar("Model")
 
 FREE = "free"
 _NO_TABLES = "must be written as [[{table}]], once for each."
-_MANY_KEYS = 3  # a file with more keys, and fewer that are known, is of another kind
+MANY_KEYS = 3  # a file with more keys, and fewer that are known, is of another kind
 _UNITS = {"mm": "mm", "um": "µm", "deg": "°", "px": "px", "ppm": "ppm", "urad": "µrad", "dm": "dm"}
 _LONGEST_PATH, _LONGEST_NAME = 4000, 255  # bytes, limits of most file systems
 
@@ -318,9 +318,11 @@ _adapter: Callable[[Any], TypeAdapter[Any]] = cache(lambda model: TypeAdapter(_a
 def _message(root: Table, model: type, error: ValidationError) -> str:
     """Message of the first wrong or missing value; else of all unknown keys; of a file of another kind just that."""
     given, known = [key for key in root.values if key in _keys(model)], sorted(_keys(model))
-    if not root.place and len(root.values) > _MANY_KEYS > len(given):
+    if not root.place and len(root.values) > MANY_KEYS > len(given):
         keys = list_words(list(root.values)[:LISTED])
-        return f"{root.file}: is a file of another kind, with the keys {keys}. Here it has {list_words(known)}."
+        needed = getattr(model, "file_kind", "")
+        needed = f"A {needed} is needed here; it has" if needed else "Here it has"
+        return f"{root.file}: is a file of another kind, with the keys {keys}. {needed} {list_words(known)}."
     unknown: list[tuple[Table, type, str]] = []
     for each in error.errors(include_url=False, include_input=False):
         kind, (table, own, rest) = each["type"], _place(root, model, each["loc"])

@@ -1,28 +1,36 @@
 """TOML files, and their tables with the places of keys for messages."""
 
 import re
+import shlex
 import tomllib
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import InputError
-from pipeline.text.files import FilePath, no_such_file, read_bytes
+from pipeline.text.files import SCAN_ENDINGS, FilePath, no_such_file, read_bytes
 from pipeline.text.wording import did_you_mean
 
 MOST_MB = 4  # size of a camera file with marks learned from 12,000 scans
 
-_NO_TOML = "It holds none; `reseau template` prints one to start from."
+_USUAL_NAMES = ("project.toml", "camera.toml", "scene.toml")
+_OTHER_KINDS = {".csv": "a CSV table", ".yaml": "a YAML file", ".yml": "a YAML file", ".json": "a JSON file"}
 _DEEP = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++\s*+\.\s*+){30}""")
 _BARE = re.compile(
     r"""\s*(?P<key>[\w."'-]+)\s*=\s*(?:(?P<word>[A-Za-z][\w./-]*)|(?P<number>[+-]?\d[\d.]*)\s*[A-Za-zµμ°%]+)\s*(?:\#.*)?$"""
 )
 
 
-def read_toml(path: FilePath) -> "Table":
-    """Read the root table of a TOML file. Raises InputError for a missing file, invalid UTF-8, or a syntax error."""
+def read_toml(path: FilePath, needed: str = "") -> "Table":
+    """Read the root table of a TOML file.
+
+    needed: usual name of the file, suggested where a folder is given. Raises InputError for a missing file, a file of
+    another kind, invalid UTF-8, or a syntax error.
+    """
     path = Path(path)
     try:
+        if path.is_file() and (other_kind := _other_kind(path)):
+            raise InputError(f"{path}: {other_kind}")
         text = read_bytes(path, MOST_MB).decode("utf-8-sig")
         if deep := _DEEP.search(text):
             line = text.count("\n", 0, deep.start()) + 1
@@ -31,8 +39,12 @@ def read_toml(path: FilePath) -> "Table":
     except FileNotFoundError:
         raise InputError(no_such_file(path)) from None
     except IsADirectoryError:
-        files = ", ".join(map(str, sorted(path.glob("*.toml"))))
-        hint = f"Name one that it holds: {files}." if files else _NO_TOML
+        files = sorted(path.glob("*.toml"))
+        usual = [file for file in files if file.name == needed]
+        possible = usual or [file for file in files if file.name not in _USUAL_NAMES]
+        hint = f"It holds no {needed or 'TOML file'}; `reseau template` prints one to start from."
+        if possible:
+            hint = f"Name one that it holds: {', '.join(map(str, possible))}."
         raise InputError(f"{path}: is a folder; a TOML file is needed here. {hint}") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: is not text in UTF-8; a TOML file, saved as such, is needed here.") from None
@@ -40,6 +52,20 @@ def read_toml(path: FilePath) -> "Table":
         raise InputError(f"{path}: is not valid TOML here: lists or tables stand in one another too deep.") from None
     except ValueError as error:  # a syntax error, or a number of thousands of digits
         raise InputError(f"{path}: is not valid TOML: {error}. {_mending(text, str(error))}") from None
+
+
+def _other_kind(path: Path) -> str:
+    """What a file is by its ending, and what is needed; "" for a file that may be TOML."""
+    ending = path.suffix.lower()
+    if ending in SCAN_ENDINGS:
+        folder = shlex.quote(str(path.parent))
+        return f"is a scan; a TOML file is needed here. To measure scans, give their folder: `reseau run {folder}`."
+    if ending in _OTHER_KINDS:
+        return (
+            f"is {_OTHER_KINDS[ending]}; a TOML file is needed here: a project, a camera or a scene, NAME.toml. "
+            "`reseau template` prints one to start from."
+        )
+    return ""
 
 
 def _mending(text: str, error: str) -> str:

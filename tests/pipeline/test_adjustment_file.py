@@ -135,6 +135,13 @@ def test_the_file_has_the_keys_of_its_contract(path: Path) -> None:
     assert list(content["groups"]["target"]) == ["sigma0", "rms_x_um", "rms_y_um", "redundancy"]
 
 
+def test_a_file_of_another_stage_is_no_adjustment(tmp_path: Path) -> None:
+    other = tmp_path / "check.json"
+    other.write_text('{"reseau": "1", "verdict": "agrees", "cameras": {}}')
+    with pytest.raises(InputError, match=r"lacks the keys 'converged', .* Name the adjustment\.json that is meant"):
+        read_adjustment(other)
+
+
 @pytest.mark.parametrize(
     ("keys", "value", "message"),
     [

@@ -464,6 +464,9 @@ def test_focal_lengths_of_square_pixels_are_one_unknown(square_pixels: bool) -> 
 def test_a_count_that_is_wrong_is_named_with_the_one_that_fits(tmp_path: Path, refusal: Refusal) -> None:
     Image.fromarray(picture(0)).save(tmp_path / "p0.png")
     assert "7 x 5 is" in refusal("calibrate", tmp_path, "--board", "6x5", "--square", "2cm", "--out", tmp_path / "o")
+    (tmp_path / "o.txt").touch()
+    message = refusal("calibrate", tmp_path, "--board", "6x5", "--square", "2cm", "--out", tmp_path / "o.txt")
+    assert "o.txt is a file, and a folder is needed there" in message
 
 
 PIXEL_MM = 0.005

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib import resources
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -137,12 +138,56 @@ def test_wrong_input_leaves_earlier_results(project: Path, refusal: Refusal, spo
 
 
 def test_a_folder_in_place_of_a_project_is_answered_by_what_it_holds(tmp_path: Path, refusal: Refusal) -> None:
-    words = "is a folder; a TOML file is needed here. It holds none; `reseau template`"
+    words = "is a folder; a TOML file is needed here. It holds no project.toml; `reseau template`"
     assert words in refusal("adjust", tmp_path)
     for name in ("project.toml", "camera.toml"):
         (tmp_path / name).touch()
-    words = f"Name one that it holds: {tmp_path}/camera.toml, {tmp_path}/project.toml."
-    assert words in refusal("adjust", tmp_path)
+    assert "It holds no scene.toml; `reseau template`" in refusal("design", tmp_path)
+    for name in ("1952.toml", "1958.toml"):
+        (tmp_path / name).touch()
+    assert f"Name one that it holds: {tmp_path}/project.toml." in refusal("adjust", tmp_path)
+    words = f"Name one that it holds: {tmp_path}/1952.toml, {tmp_path}/1958.toml."
+    assert words in refusal("design", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("measure", "p.toml", "--workers", "0"), "'--workers': must be at least 1, not 0."),
+        (("compare", "a.json", "--level", "2"), "'--level': must be at most 0.5, not 2."),
+        (("cameras", "--pitch", "abc"), "'--pitch': must be a number, not 'abc'."),
+        (("review", "p.toml", "--port", "1.5"), "'--port': must be a whole number, not '1.5'."),
+    ],
+)
+def test_a_wrong_value_of_an_option_is_refused_as_in_a_table(
+    arguments: tuple[str, ...], words: str, refusal: Refusal
+) -> None:
+    assert words in refusal(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("left.JPG", ["is a scan; a TOML file is needed", "`reseau run {folder}`"]),
+        ("points.csv", ["is a CSV table; a TOML file is needed", "`reseau template`"]),
+        ("lens.yaml", ["is a YAML file; a TOML file is needed"]),
+    ],
+)
+def test_a_file_of_another_kind_in_place_of_a_project(
+    name: str, words: list[str], tmp_path: Path, refusal: Refusal
+) -> None:
+    (tmp_path / name).write_bytes(b"\xff\xd8\xff")
+    message = refusal("run", tmp_path / name)
+    for word in words:
+        assert word.format(folder=tmp_path) in message
+
+
+def test_a_file_in_place_of_a_folder_is_named(tmp_path: Path, refusal: Refusal) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text(resources.files("pipeline").joinpath("templates", "scene.toml").read_text("utf-8"), "utf-8")
+    words = f"{scene} is a file, and a folder is needed there"
+    assert words in refusal("render", scene, scene)
+    assert words in refusal("render", scene, scene / "below")
 
 
 def pixels_for_mm(rows: list[str]) -> list[str]:

@@ -20,6 +20,7 @@ from pipeline.archive.measure_archive import check_measurable
 from pipeline.files.camera_file import camera_text, read_camera
 from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_file import Project, read_project
+from pipeline.rendered.scene_file import read_scene
 from pipeline.results.comparator_file import read_comparator, write_comparator
 from pipeline.text.files import check_writable, write_atomically
 from pipeline.text.tables import read_toml
@@ -206,6 +207,7 @@ def test_what_is_missing_for_a_camera_or_a_project_is_reported(tmp_path: Path) -
         tmp_path, "project.toml", "\n".join(f"{key} = 1" for key in ("scans", "output", "exclude", "camera"))
     )
     refused(read_camera, path, [f"{path}: is a file of another kind, with the keys 'scans', 'output'", "'frame_mm'"])
+    refused(read_scene, path, ["is a file of another kind", "A scene file (`reseau template scene` prints one)"])
     refused(read_toml, tmp_path / "poject.toml", ["there is no such file", "Did you mean 'project.toml'?"])
     (tmp_path / "loop.toml").symlink_to("loop.toml")
     refused(read_toml, tmp_path / "loop.toml", ["loop.toml"])
