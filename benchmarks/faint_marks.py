@@ -3,7 +3,7 @@
 --frames: number per cell, each with three faint marks. A frame of 60 mm (10 px per mm) has eight marks of one kind with
 blurs equal to 5 %: five at SNR 20, three at the SNR of the cell. A value is RMS / bound and realised / claimed; -n: not
 found. The images and bounds are those of `marks`; the measuring function is that of `reseau measure`,
-`measure.fiducials.frame.measure_frame`.
+`measure.fiducials.measure_frame.measure_frame`.
 """
 
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ from true_marks import KIND, KINDS, Kind, TrueMark, some_mark
 from benchmarks.dusty_marks import BLUR_SPREAD, PX_PER_MM, frame_layout, start_placement
 from benchmarks.harness import Row
 from benchmarks.measured_marks import CONTRAST, GROUND, Cell, Found, best_errors
-from measure.fiducials.frame import measure_frame
+from measure.fiducials.measure_frame import measure_frame
 from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import FiducialLayout
 from measure.scans.cache import WholePicture

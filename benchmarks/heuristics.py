@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from true_marks import KIND
 
-import measure.fiducials.frame as frame_measurement
+import measure.fiducials.measure_frame as frame_measurement
 import measure.targets.identification as targets
 from adjust.linear_algebra import fronts
 from adjust.solution.adjustment import adjust

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from true_marks import ALL_MOVES, TrueMark
 
 from measure.detection.localisation import MarkPrediction
-from measure.fiducials.frame import CLEAR_DAMAGE
 from measure.fiducials.mark_fit import detect_mark
+from measure.fiducials.measure_frame import CLEAR_DAMAGE
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Cause
 from measure.targets.disks import fit_disk

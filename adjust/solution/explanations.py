@@ -10,6 +10,8 @@ Scheffé's, with the unknowns of all contrasts, and Bonferroni's, over all parti
 the level LEVEL. Hypotheses are compared with each other, and with gross errors of single observations, by v'Pv plus
 twice the unknowns and the logarithm of the choices (Akaike); those within TOLD_APART of the best are reported with it.
 
+A hypothesis with unknowns for every image stays only where it explains significantly more than every simpler one.
+
 What is left may be noise that is larger than given: residuals of equal variance in all images and independent of their
 neighbours, where a standard deviation added to that of all marks, of targets alone or of fiducials alone, or a factor
 on those of the given points, makes every group of observations agree, and explains more than gross errors do.
@@ -53,8 +55,10 @@ STEPS = 40  # images of another pitch need about 20
 LEAST_SHARE = 0.05  # of v'Pv; further lens terms remove up to 0.02 on real boards
 TURNS = 8  # adjustments, each with the variance of the one before
 ENDING = ("groups", "distances", "affinities")  # after which nothing else is sought
-SHARED = ("radial", "decentering", "bow", "pixels", "shear", "drift", "jump", "groups", "distances", "board", "disks")
-GENERAL = {"distances": ("drift", "groups"), "affinities": SHARED}  # hypotheses on every image, and what is simpler
+OF_IMAGES = ("radial", "decentering", "bow", "pixels", "shear", "drift", "jump", "interior", "groups", "distances")
+OF_POINTS = ("board", "disks", "point")
+# Kinds of hypotheses with unknowns for every image, and the simpler ones that may explain as much.
+GENERAL = {"distances": ("drift", "groups"), "affinities": OF_IMAGES + OF_POINTS}
 FEWEST = 30  # coordinates needed to test the distribution of residuals
 CHANCE = 0.001  # significance level of each test of the noise hypothesis
 NEIGHBOURS = 8  # nearest neighbours searched for one in the same, or in another, image

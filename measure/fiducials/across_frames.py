@@ -32,8 +32,8 @@ from measure.fiducials.consistency import (
     frame_consistency,
     frame_p_value,
 )
-from measure.fiducials.frame import may_be_wrong
 from measure.fiducials.mark_comparison import check_own_figures
+from measure.fiducials.measure_frame import may_be_wrong
 from measure.fiducials.options import ANY_FILM, SCATTER_DEGREES, BelievedFilm
 from measure.flags import FALSE_DOUBT, NO_REASON, Cause, Code, Reason, Status
 from measure.geometry import UP_FROM_CAMERA

@@ -13,7 +13,7 @@ from scipy.special import comb
 from measure.detection.localisation import localise
 from measure.detection.responses import Effort
 from measure.fiducials.constellation import Placement, distinct_places
-from measure.fiducials.frame import Frame, detect_frame
+from measure.fiducials.measure_frame import Frame, detect_frame
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import FrameSearch, PitchHypothesis
 from measure.fiducials.stages import false_placements

@@ -7,7 +7,7 @@ import numpy as np
 
 from measure.array_types import Array
 from measure.fiducials.constellation import Placement
-from measure.fiducials.frame import Frame, measure_frame
+from measure.fiducials.measure_frame import Frame, measure_frame
 from measure.fiducials.options import FiducialOptions
 from measure.flags import NO_REASON, Code, Reason
 from measure.geometry import POSES, UP_FROM_CAMERA, linear_scale

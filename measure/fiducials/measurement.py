@@ -14,9 +14,9 @@ from measure.annotations.text import networks, read_writing
 from measure.array_types import Array
 from measure.fiducials.clicked_frame import clicked_frame
 from measure.fiducials.constellation import Placement
-from measure.fiducials.frame import Frame, measure_frame, rename_frame
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA
 from measure.fiducials.mark_fit import Detection
+from measure.fiducials.measure_frame import Frame, measure_frame, rename_frame
 from measure.fiducials.options import CLICK_SIGMA_PX, Click, FiducialOptions
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import SearchResult

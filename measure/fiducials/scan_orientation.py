@@ -17,8 +17,8 @@ from scipy import ndimage
 
 from measure.annotations.lines import Line, is_of_film, is_plate, signs
 from measure.array_types import Array, Mask
-from measure.fiducials.frame import Frame
 from measure.fiducials.interior_orientation import fit_frame
+from measure.fiducials.measure_frame import Frame
 from measure.fiducials.options import SCATTER_DEGREES
 from measure.geometry import POSES, UP_FROM_CAMERA, linear_scale, pose_in_camera, turn_by_quarters
 from measure.marks.rendering import ROUGH_CELLS, chip_mask, detail_px, extent_px, picture

@@ -20,7 +20,8 @@ from scipy.special import bdtrc, comb
 from measure.array_types import Array
 from measure.detection.correlation import CLOSE, GRAINY, WIDE, Surroundings
 from measure.fiducials.constellation import NARROW, Placement, distinct_places
-from measure.fiducials.frame import (
+from measure.fiducials.interior_orientation import AFFINITY_SIGMA
+from measure.fiducials.measure_frame import (
     CHECKED,
     FITTED_PX,
     RANDOM_PLACES,
@@ -31,7 +32,6 @@ from measure.fiducials.frame import (
     rename_frame,
     shows_marks,
 )
-from measure.fiducials.interior_orientation import AFFINITY_SIGMA
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.scan_orientation import decide_pose
 from measure.fiducials.search import (

@@ -16,8 +16,8 @@ import numpy as np
 
 from measure.detection.localisation import MarkPrediction
 from measure.errors import MeasurementError
-from measure.fiducials.frame import LEAST_LIKENESS
 from measure.fiducials.mark_fit import Detection, detect_mark
+from measure.fiducials.measure_frame import LEAST_LIKENESS
 from measure.geometry import Affine, linear_scale
 from measure.marks.rendering import reach_px
 from measure.marks.shapes import FrameCorner, Mark, MarkShape, Point, limit_to_frame

@@ -14,8 +14,8 @@ from measure.detection.responses import ByteCache, Responses
 from measure.fiducials import consistency, stages
 from measure.fiducials.across_frames import check_frames
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, same_picture
-from measure.fiducials.frame import Frame, fit_lines_and_sharpening, measure_frame
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA, fit_frame
+from measure.fiducials.measure_frame import Frame, fit_lines_and_sharpening, measure_frame
 from measure.fiducials.measurement import _lacks_its_own, present_frame
 from measure.fiducials.scan_checks import pitch_problem
 from measure.fiducials.scan_orientation import SPOILT, MarkSite, PosedMark, decide_pose

@@ -12,8 +12,8 @@ from true_marks import KIND, TrueMark, some_mark
 from measure import FiducialLayout, FiducialOptions, LayoutMark, MarkShape, Status, cross
 from measure.fiducials import mark_comparison
 from measure.fiducials.constellation import Placement
-from measure.fiducials.frame import Frame, choose_fit, compare_shapes, detect_frame, measure_frame, orient_frame
 from measure.fiducials.mark_fit import not_found
+from measure.fiducials.measure_frame import Frame, choose_fit, compare_shapes, detect_frame, measure_frame, orient_frame
 from measure.fiducials.measurement import absent_frame
 from measure.fiducials.stages import explain_misfit
 from measure.flags import NO_REASON, Cause

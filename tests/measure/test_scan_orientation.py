@@ -16,7 +16,7 @@ from studies import parametrize_with_studies
 
 from measure import FrameMeasurement, MatchOptions, ScanWindow, Status, match, measure_fiducials
 from measure.annotations.lines import KnownLine, Line, Reading, read_from_one_face
-from measure.fiducials.frame import measure_frame, rename_frame
+from measure.fiducials.measure_frame import measure_frame, rename_frame
 from measure.fiducials.options import FiducialOptions, Reads
 from measure.fiducials.scan_orientation import Drawings, MarkSite, PosedMark, side_in_camera, writing_likelihoods
 from measure.fiducials.search import FrameSearch, pitch_hypotheses

@@ -20,8 +20,8 @@ import measure
 from measure import FiducialLayout, LayoutMark, Status, read_window
 from measure.detection.localisation import MarkPrediction
 from measure.fiducials.constellation import Placement
-from measure.fiducials.frame import Frame, measure_frame, shift_to_curve
 from measure.fiducials.mark_fit import Detection, detect_mark, options_for
+from measure.fiducials.measure_frame import Frame, measure_frame, shift_to_curve
 from measure.flags import Cause
 from measure.scans.jpeg import covariance_of_compression, rounding_step_dn
 from measure.scans.opening import declared_tone
