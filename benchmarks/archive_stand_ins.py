@@ -21,7 +21,7 @@ from pipeline.archive.results_database import Kept, Store
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_measurement import MeasuredFile
 from pipeline.measuring.scan_task import ScanTask, scan_tasks
-from pipeline.provenance import Identity, file_state, parts_hash
+from pipeline.provenance import FileIdentity, file_state, parts_hash
 from pipeline.results.comparator_file import write_comparator
 from pipeline.results.measured_record import MeasuredScan
 
@@ -90,7 +90,7 @@ def _frames(project: Project, store: Store, home: Path) -> Iterator[CheckedResul
     for number, task in enumerate(scan_tasks(project, tuple(project.scans))):
         scan = stand_in(task).scan
         scan, path = _lose_marks(scan) if number % _LOSES == 1 else scan, Path(task.scan)
-        identity = Identity(file_state(path, home), parts_hash(path))
+        identity = FileIdentity(file_state(path, home), parts_hash(path))
         yield CheckedResult(store.keep(Kept(identity, "{}", scan), task.name), scan)
 
 

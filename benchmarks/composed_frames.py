@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from benchmarks.harness import Row
 from benchmarks.search import OUTCOMES, POSE_OUTCOMES, counts, judge_case
-from benchmarks.search_frames import Case
+from benchmarks.search_frames import SearchCase
 from measure.geometry import POSES, UP_FROM_CAMERA
 from measure.marks.shapes import FiducialLayout, LayoutMark
 from measure.marks.templates import cut, learn_template
@@ -57,14 +57,14 @@ def find_cameras(marks: Path) -> list[str]:
     return [str(each.relative_to(marks)) for each in folders if set(SIDES) <= {path.stem for path in each.iterdir()}]
 
 
-def draw_case(camera: Path, index: int, turn: int) -> Case:
+def draw_case(camera: Path, index: int, turn: int) -> SearchCase:
     """Make frame number index of a camera. turn: selects pose and background, differently for each camera."""
     learned_dn, view_dn = LANDSCAPES_DN[turn % len(LANDSCAPES_DN)]
     round_, pose = index // len(LANDSCAPES_DN), POSES[(3 * index + turn) % len(POSES)]
     grey, places = composed(cut_crops(camera), np.random.default_rng([index, 1]), view_dn)
     up, origins = UP_FROM_CAMERA[pose], origins_px(round_)
     centers = {side: FLIP @ up @ FLIP @ (places[side] + origins[side] - MIDDLE_PX) + MIDDLE_PX for side in SIDES}
-    return Case(
+    return SearchCase(
         kind=camera.name,
         symmetry="different marks",
         picture=f"{learned_dn}, seen beside {view_dn}",

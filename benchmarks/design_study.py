@@ -33,7 +33,7 @@ LAYOUTS = 30
 
 
 @dataclass(frozen=True)
-class Camera:
+class StudyCamera:
     """Camera (mm) and its object distance (m)."""
 
     name: str
@@ -42,13 +42,13 @@ class Camera:
     distance: float
 
 
-WIDE = Camera("wide angle, 23 x 23 / 15", 230.0, 150.0, 1500.0)
-NORMAL = Camera("normal angle, 23 x 23 / 30", 230.0, 300.0, 3000.0)
-HANDY = Camera("6 x 6 / 60 (close range)", 55.0, 60.0, 4.0)
+WIDE = StudyCamera("wide angle, 23 x 23 / 15", 230.0, 150.0, 1500.0)
+NORMAL = StudyCamera("normal angle, 23 x 23 / 30", 230.0, 300.0, 3000.0)
+HANDY = StudyCamera("6 x 6 / 60 (close range)", 55.0, 60.0, 4.0)
 
 
 @dataclass(frozen=True)
-class Plan:
+class StudyPlan:
     """Network design of the study; the defaults are the standard one.
 
     Attributes
@@ -63,7 +63,7 @@ class Plan:
     target_um, fiducial_um : standard deviations of image coordinates.
     """
 
-    camera: Camera = WIDE
+    camera: StudyCamera = WIDE
     points: int = 100
     relief: float = 0.0
     control: str = "known"
@@ -159,7 +159,7 @@ def _angles(axis: np.ndarray[Any, Any], turn: float, kappa: float) -> tuple[floa
 HEADS = ("fiducials", "c", "x0', y0'", "radial", "tangential")
 
 
-def row(plan: Plan) -> tuple[list[float], int]:
+def row(plan: StudyPlan) -> tuple[list[float], int]:
     """Expected sigmas in the order of HEADS, µm, mean over the layouts, and the number of undetermined quantities.
 
     They are those of the photographs alone, in the datum of the fiducials; inf: not determined. The distortion is at
@@ -179,16 +179,16 @@ def row(plan: Plan) -> tuple[list[float], int]:
     return [float(value) for value in np.mean(found, axis=0)], defect
 
 
-def study() -> Iterable[tuple[str, str, list[tuple[str, Plan]]]]:
+def study() -> Iterable[tuple[str, str, list[tuple[str, StudyPlan]]]]:
     """Yield key, title and designs of each table."""
     fields = [
-        ("known, flat", Plan()),
-        ("known, relief 5 %", Plan(relief=0.05)),
-        ("known, relief 20 %", Plan(relief=0.2)),
-        ("heights only, flat", Plan(control="heights")),
-        ("heights only, relief 20 %", Plan(control="heights", relief=0.2)),
-        ("unknown (self-calibration), flat", Plan(control="unknown")),
-        ("unknown (self-calibration), relief 20 %", Plan(control="unknown", relief=0.2)),
+        ("known, flat", StudyPlan()),
+        ("known, relief 5 %", StudyPlan(relief=0.05)),
+        ("known, relief 20 %", StudyPlan(relief=0.2)),
+        ("heights only, flat", StudyPlan(control="heights")),
+        ("heights only, relief 20 %", StudyPlan(control="heights", relief=0.2)),
+        ("unknown (self-calibration), flat", StudyPlan(control="unknown")),
+        ("unknown (self-calibration), relief 20 %", StudyPlan(control="unknown", relief=0.2)),
     ]
     yield "fields-vertical", "Test fields, five vertical photographs", fields
     convergent = [(words, replace(plan, tilt_deg=30.0)) for words, plan in fields]
@@ -197,8 +197,8 @@ def study() -> Iterable[tuple[str, str, list[tuple[str, Plan]]]]:
         (f"{camera.name}, {words}", replace(plan, camera=camera))
         for camera in (WIDE, NORMAL, HANDY)
         for words, plan in (
-            ("vertical, relief 20 %", Plan(relief=0.2)),
-            ("convergent 30°, flat", Plan(tilt_deg=30.0)),
+            ("vertical, relief 20 %", StudyPlan(relief=0.2)),
+            ("convergent 30°, flat", StudyPlan(tilt_deg=30.0)),
         )
     ]
     yield "cameras", "Cameras, known field", cameras
@@ -206,7 +206,7 @@ def study() -> Iterable[tuple[str, str, list[tuple[str, Plan]]]]:
         "kappa",
         "Kappa, five convergent photographs (30°)",
         [
-            (f"{words}, {kind}", Plan(tilt_deg=30.0, kappas_deg=kappas, control=kind))
+            (f"{words}, {kind}", StudyPlan(tilt_deg=30.0, kappas_deg=kappas, control=kind))
             for kind in ("known", "unknown")
             for words, kappas in (
                 ("all alike", (0.0,)),
@@ -221,13 +221,13 @@ def study() -> Iterable[tuple[str, str, list[tuple[str, Plan]]]]:
         "transformations",
         "Fiducials and film transformations, five convergent photographs (30°), known field",
         [
-            (f"{kind}, {count} fiducials", Plan(tilt_deg=30.0, transformation=kind, fiducials=count))
+            (f"{kind}, {count} fiducials", StudyPlan(tilt_deg=30.0, transformation=kind, fiducials=count))
             for kind in ("congruent", "similarity", "affine", "bilinear", "projective", "polynomial(2)")
             for count in (4, 8)
             if not (kind == "polynomial(2)" and count == 4)
         ],
     )
-    base = Plan(tilt_deg=30.0)
+    base = StudyPlan(tilt_deg=30.0)
     yield (
         "photos",
         "Number of photographs, the first vertical, flat known field",

@@ -41,7 +41,7 @@ NEAR_PX = 3.0  # px, largest distance of a point of OpenCV from its true place
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class BoardCase:
     """Board and its drawing. drawing: with PX_PER_MM, its upper left corner at corner_mm; is_mirrored, cut_px: whether
     the image is mirrored, and columns cut off at its left."""
 
@@ -53,10 +53,10 @@ class Case:
     cut_px: int = 0
 
 
-def drawings() -> Iterator[Case]:
+def drawings() -> Iterator[BoardCase]:
     chess = ChessboardSpec(9, 6, 20.0)
-    yield Case("chessboard 9 x 6", chess, _squares(chess), (-20.0, 120.0))
-    yield Case("the same, two columns outside of the picture", chess, _squares(chess), (-20.0, 120.0), cut_px=150)
+    yield BoardCase("chessboard 9 x 6", chess, _squares(chess), (-20.0, 120.0))
+    yield BoardCase("the same, two columns outside of the picture", chess, _squares(chess), (-20.0, 120.0), cut_px=150)
     for name, spec in (
         ("ChArUco 8 x 6", CharucoSpec("4X4_50", 8, 6, 25.0, 18.0)),
         ("ChArUco 8 x 6, older layout, first marker 20", CharucoSpec("4X4_250", 8, 6, 25.0, 18.0, None, 20)),
@@ -65,20 +65,20 @@ def drawings() -> Iterator[Case]:
         board = cv2.aruco.CharucoBoard((8, 6), 25.0, 18.0, aruco_dictionary(spec.dictionary), numbers)
         board.setLegacyPattern(bool(spec.first_id))
         sheet = board.generateImage((200 * PX_PER_MM, 150 * PX_PER_MM), marginSize=0, borderBits=1)
-        yield Case(name, spec, np.asarray(sheet, np.uint8), (-25.0, 125.0))
+        yield BoardCase(name, spec, np.asarray(sheet, np.uint8), (-25.0, 125.0))
     aruco = ArucoSpec("5X5_100", 5, 4, 30.0, 10.0)
     grid = cv2.aruco.GridBoard((5, 4), 30.0, 10.0, aruco_dictionary("5X5_100"))
     drawing: Bytes = np.asarray(
         grid.generateImage((190 * PX_PER_MM, 150 * PX_PER_MM), marginSize=0, borderBits=1), np.uint8
     )
-    yield Case("ArUco 5 x 4", aruco, drawing, (0.0, 150.0))
-    yield Case("ArUco 5 x 4, mirrored", aruco, drawing, (0.0, 150.0), is_mirrored=True)
+    yield BoardCase("ArUco 5 x 4", aruco, drawing, (0.0, 150.0))
+    yield BoardCase("ArUco 5 x 4, mirrored", aruco, drawing, (0.0, 150.0), is_mirrored=True)
     april = AprilGridSpec("APRILTAG_36h11", 5, 4, 30.0, 9.0)
-    yield Case("AprilGrid 5 x 4 (Kalibr)", april, _april_grid(april), (-9.0, 156.0))
+    yield BoardCase("AprilGrid 5 x 4 (Kalibr)", april, _april_grid(april), (-9.0, 156.0))
     circles = CircleGridSpec(8, 6, 25.0, 14.0)
-    yield Case("circle grid 8 x 6", circles, _circles(circles), (-25.0, 150.0))
+    yield BoardCase("circle grid 8 x 6", circles, _circles(circles), (-25.0, 150.0))
     staggered = CircleGridSpec(8, 11, 18.0, 14.0, asymmetric=True)
-    yield Case("asymmetric circle grid 4 x 11", staggered, _circles(staggered), (-18.0, 198.0))
+    yield BoardCase("asymmetric circle grid 4 x 11", staggered, _circles(staggered), (-18.0, 198.0))
 
 
 COLUMNS = {
@@ -115,7 +115,7 @@ def case(board: str) -> Row:
     return row
 
 
-def photographed(case: Case, number: int) -> tuple[Bytes, dict[str, Array]]:
+def photographed(case: BoardCase, number: int) -> tuple[Bytes, dict[str, Array]]:
     """Image of a board, and the true places of its points."""
     rotation = np.asarray(cv2.Rodrigues(np.array(TURNS[number]))[0]) @ np.diag([1.0, -1.0, -1.0])
     points = case.spec.object_points()

@@ -25,7 +25,7 @@ ZOOMS = 0.52, 3.5  # range of an unknown principal distance relative to C_MM: 0.
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class TargetFrame:
     """Simulated frame. xyz, normals: (n, 3) field; xy_mm: (m, 2) marks; point: (m,) true index of each, -1 for a false
     mark."""
 
@@ -50,7 +50,7 @@ def spatial(n: int, rng: np.random.Generator) -> tuple[Array, Array]:
     return xyz, np.full((n, 3), np.nan)
 
 
-def frame(xyz: Array, normals: Array, share: float, rng: np.random.Generator, zoom: float = 1.0) -> Frame:
+def frame(xyz: Array, normals: Array, share: float, rng: np.random.Generator, zoom: float = 1.0) -> TargetFrame:
     """Simulate a frame from within 45 degrees of the z axis, roughly filled by the field. share: of missing points and
     false marks; zoom: factor of both distance and principal distance."""
     tilt, around, roll = rng.uniform(0.0, np.pi / 4), rng.uniform(0.0, 2 * np.pi), rng.uniform(0.0, 2 * np.pi)
@@ -68,14 +68,14 @@ def frame(xyz: Array, normals: Array, share: float, rng: np.random.Generator, zo
     false = rng.uniform(-HALF_MM, HALF_MM, (round(share * len(view)), 2))
     marks, point = np.concatenate([xy[kept], false]), np.concatenate([kept, np.full(len(false), -1)])
     order = rng.permutation(len(marks))
-    return Frame(xyz, normals, marks[order], point[order])
+    return TargetFrame(xyz, normals, marks[order], point[order])
 
 
-def named(one: Frame, c_mm: float | None) -> Names | str:
+def named(one: TargetFrame, c_mm: float | None) -> Names | str:
     return name_marks(one.xyz, one.normals, one.xy_mm, (-HALF_MM, HALF_MM), c_mm, SIGMA_PX * PITCH_MM)
 
 
-def verdict(one: Frame, names: Names | str) -> str:
+def verdict(one: TargetFrame, names: Names | str) -> str:
     """Outcome: "right" if at least 80 % of the visible points are identified, "few" if fewer; "wrong" if more than one
     identification in fifty is wrong."""
     if isinstance(names, str):

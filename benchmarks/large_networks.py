@@ -25,7 +25,7 @@ POINTS_AN_IMAGE, CONTROL_EVERY = 50, 10  # of a strip: points per image, images 
 
 
 @dataclass(frozen=True)
-class Scene:
+class LargeScene:
     """Network to adjust, with its data for other programs.
 
     points: (p, 3); visible: by image, indices of the points and their places (m, 2), mm, y up.
@@ -37,7 +37,7 @@ class Scene:
     visible: list[VisiblePoints]
 
 
-def make_board(views: int, relief: float = 0.05) -> Scene:
+def make_board(views: int, relief: float = 0.05) -> LargeScene:
     """Board of 100 points with some relief, all visible in each view."""
     rng = np.random.default_rng(views)
     grid = (np.arange(10) - 4.5) * 0.1
@@ -49,7 +49,7 @@ def make_board(views: int, relief: float = 0.05) -> Scene:
     return _scene(rng, points, stations, angles, "known", np.zeros(len(points)), 0.002)
 
 
-def unknown(images: int, points: int) -> Scene:
+def unknown(images: int, points: int) -> LargeScene:
     """Aerial block of 60 % overlap along and across, attitudes within a few degrees, one point in a hundred known."""
     rng = np.random.default_rng(images)
     across = int(np.sqrt(images / 2))
@@ -66,7 +66,7 @@ def unknown(images: int, points: int) -> Scene:
     return _scene(rng, xyz, stations, angles, "unknown", sigma, 0.02)
 
 
-def strip(images: int, control: int = CONTROL_EVERY) -> Scene:
+def strip(images: int, control: int = CONTROL_EVERY) -> LargeScene:
     """Strip of 60 % overlap, fifty points per image, with known points every `control` images; 0: only at the start."""
     rng = np.random.default_rng(images)
     base, height = 0.4 * FRAME_MM, 1.0 * FOCAL_MM
@@ -85,7 +85,7 @@ def strip(images: int, control: int = CONTROL_EVERY) -> Scene:
 
 def _scene(
     rng: np.random.Generator, points: Array, stations: Array, angles: Array, task: str, sigma: Array, error: float
-) -> Scene:
+) -> LargeScene:
     """Scene with noisy projections by OpenCV. error: sigma of the approximate values, object units; angles have a
     hundredth of it, rad."""
     projected = _projected(rng, points, stations, angles)
@@ -101,7 +101,7 @@ def _scene(
         {},
         {str(i): xyz + error * rng.normal(size=3) for i, xyz in enumerate(points)},
     )
-    return Scene(network, start, points, projected)
+    return LargeScene(network, start, points, projected)
 
 
 def _projected(rng: np.random.Generator, points: Array, stations: Array, angles: Array) -> list[VisiblePoints]:

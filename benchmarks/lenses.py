@@ -23,8 +23,8 @@ from adjust.problem.observations import ObservationKind, Observations
 from adjust.solution.adjustment import adjust
 from benchmarks.harness import Row
 from synthetic_images.projection import camera_from_object
-from synthetic_images.scene import Distortion as SceneDistortion
 from synthetic_images.scene import Family, SceneCamera
+from synthetic_images.scene import SceneDistortion as SceneDistortion
 
 Array = NDArray[np.float64]
 Drawn = Callable[[np.random.Generator | None], Network]

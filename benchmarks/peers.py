@@ -28,7 +28,7 @@ from adjust.functional_model.lens import Prior
 from adjust.solution.adjustment import Options, adjust
 from benchmarks import harness, scale
 from benchmarks.harness import Row
-from benchmarks.large_networks import FOCAL_MM, FRAME_MM, SIGMA_MM, Scene, make_board
+from benchmarks.large_networks import FOCAL_MM, FRAME_MM, SIGMA_MM, LargeScene, make_board
 from benchmarks.scale import GUESS, OFF, PIXELS_PER_MM, pixels_of_images
 
 Array = NDArray[np.float64]
@@ -112,7 +112,7 @@ def command_s(command: str) -> float:
         return harness.reseau(command, f"{folder}/project.toml").cpu_seconds
 
 
-def spoilt(scene: Scene, percent: int) -> Scene:
+def spoilt(scene: LargeScene, percent: int) -> LargeScene:
     """Add gross errors to some of the observations of a scene."""
     rng = np.random.default_rng(percent)
     xy_mm = scene.network.observations.xy_mm.copy()
@@ -127,18 +127,18 @@ def spoilt(scene: Scene, percent: int) -> Scene:
 Found = tuple[float, float]  # c, mm, and CPU seconds
 
 
-def reseau(scene: Scene, relief: bool, given: bool, gross: bool) -> Found:
+def reseau(scene: LargeScene, relief: bool, given: bool, gross: bool) -> Found:
     c = Prior(FOCAL_MM * OFF, np.inf) if given else None
     found = scale.reseau_from_points(scene, c, Options(robust="igg3") if gross else None)
     return found["c_mm"], found["cpu_seconds"]
 
 
-def opencv(scene: Scene, relief: bool, given: bool, gross: bool) -> Found:
+def opencv(scene: LargeScene, relief: bool, given: bool, gross: bool) -> Found:
     found = scale.opencv(scene, free=not given, flat=not relief)
     return found["c_mm"], found["cpu_seconds"]
 
 
-def colmap(scene: Scene, relief: bool, given: bool, gross: bool) -> Found:
+def colmap(scene: LargeScene, relief: bool, given: bool, gross: bool) -> Found:
     import pycolmap
 
     begin = time.process_time()
@@ -207,7 +207,7 @@ print(json.dumps([float(intrinsics[0, :2].mean()), time.process_time() - begin])
 """
 
 
-def mrcal(scene: Scene, relief: bool, given: bool, gross: bool) -> Found:
+def mrcal(scene: LargeScene, relief: bool, given: bool, gross: bool) -> Found:
     """Run mrcal in a process of the system's interpreter."""
     observations = np.full((len(scene.visible), 100, 3), -1.0)
     for of_view, (inside, _), places in zip(observations, scene.visible, pixels_of_images(scene), strict=True):
@@ -221,6 +221,6 @@ def mrcal(scene: Scene, relief: bool, given: bool, gross: bool) -> Found:
     return c_px / PIXELS_PER_MM, seconds
 
 
-PROGRAMS: dict[str, Callable[[Scene, bool, bool, bool], Found]] = {
+PROGRAMS: dict[str, Callable[[LargeScene, bool, bool, bool], Found]] = {
     "reseau": reseau, "opencv": opencv, "mrcal": mrcal, "colmap": colmap,
 }  # fmt: skip

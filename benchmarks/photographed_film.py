@@ -22,14 +22,14 @@ from synthetic_images.render import render_scene
 from synthetic_images.scene import (
     DiskField,
     DiskTarget,
-    Distortion,
-    Film,
-    Scanner,
     Scene,
     SceneCamera,
+    SceneDistortion,
     SceneFiducial,
+    SceneFilm,
     SceneImage,
-    TakingLens,
+    SceneScanner,
+    SceneTakingLens,
     Tones,
 )
 
@@ -74,10 +74,10 @@ def photographed(
 ) -> tuple[np.ndarray, np.ndarray, int, tuple[str, ...]]:
     """Errors and standard deviations of coordinates, px, number of measured marks, and problems of the frame."""
     fiducials = tuple(SceneFiducial(str(k), place, CROSS) for k, place in enumerate(PLACES))
-    camera = SceneCamera("film", (228.0, 228.0), 150.0, (0.0, 0.0), Distortion("torlegard", {}), fiducials)
-    taken_by = TakingLens(FOCAL_PX, k1=k1)
-    scanner = Scanner((PITCH_UM, PITCH_UM), margin_mm=6.0, noise=0.01, lens=taken_by)
-    film = Film("projective", tilt_deg=tilt_deg, tilt_direction_deg=direction_deg)
+    camera = SceneCamera("film", (228.0, 228.0), 150.0, (0.0, 0.0), SceneDistortion("torlegard", {}), fiducials)
+    taken_by = SceneTakingLens(FOCAL_PX, k1=k1)
+    scanner = SceneScanner((PITCH_UM, PITCH_UM), margin_mm=6.0, noise=0.01, lens=taken_by)
+    film = SceneFilm("projective", tilt_deg=tilt_deg, tilt_direction_deg=direction_deg)
     targets = DiskField((DiskTarget("1", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),), 0.001)
     image = SceneImage("f", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0))
     scene = Scene("film", seed, camera, targets, (image,), scanner, film, Tones(contrast=0.0))

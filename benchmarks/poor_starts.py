@@ -48,7 +48,7 @@ FIDUCIALS = {"1": (106.0, -106.0), "2": (-106.0, -106.0), "3": (-106.0, 106.0), 
 
 
 @dataclass(frozen=True)
-class Scene:
+class StartScene:
     """Simulated network with its true values. options: of the adjustment, with the datum."""
 
     network: Network
@@ -86,12 +86,12 @@ def case(network: str, start: str | int, runs: int = 100) -> TableRow:
 
 
 @cache
-def right_adjustment(network: str) -> tuple[Scene, Adjustment]:
+def right_adjustment(network: str) -> tuple[StartScene, Adjustment]:
     scene = scenes()[network]
     return scene, adjust(scene.network, scene.truth, scene.options)
 
 
-def outcome(scene: Scene, right: Adjustment, start: Approximations | None, near: float) -> Ended:
+def outcome(scene: StartScene, right: Adjustment, start: Approximations | None, near: float) -> Ended:
     """Outcome of an adjustment, and its iterations. near: tolerance around the correct values, standard deviations."""
     try:
         result = adjust(scene.network, start, scene.options)
@@ -105,7 +105,7 @@ def outcome(scene: Scene, right: Adjustment, start: Approximations | None, near:
     return "right" if same else "other minimum", result.iterations
 
 
-def spoilt(scene: Scene, percent: int, rng: np.random.Generator) -> Scene:
+def spoilt(scene: StartScene, percent: int, rng: np.random.Generator) -> StartScene:
     """Add gross errors to some of the targets of a scene, with robust estimation."""
     observations = scene.network.observations
     targets = np.flatnonzero(~observations.is_fiducial)
@@ -116,7 +116,7 @@ def spoilt(scene: Scene, percent: int, rng: np.random.Generator) -> Scene:
     return replace(scene, network=network, options=replace(scene.options, robust="igg3" if percent else False))
 
 
-def poor_start(scene: Scene, errors: set[str], rng: np.random.Generator) -> Approximations:
+def poor_start(scene: StartScene, errors: set[str], rng: np.random.Generator) -> Approximations:
     """True values with errors added."""
     truth = scene.truth
     known = {point.id: point for point in scene.network.points}
@@ -146,7 +146,7 @@ def direction(rng: np.random.Generator) -> Array:
     return np.asarray(v / np.linalg.norm(v))
 
 
-def scenes() -> dict[str, Scene]:
+def scenes() -> dict[str, StartScene]:
     """The five types of networks: aerial ones in metres, those of a digital camera in units of half a metre."""
     rng = np.random.default_rng(2)
     plan = np.stack(np.meshgrid(np.linspace(-800, 800, 6), np.linspace(-800, 800, 5)), axis=-1).reshape(-1, 2)
@@ -205,7 +205,7 @@ class Optics:
         return np.array([0.0 if distance is None else distance.value, 0.1, -0.1])
 
 
-def film_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, known: str) -> Scene:
+def film_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, known: str) -> StartScene:
     """Scene of a film camera of 153 mm. known: object points that are known, "fixed" (all), "heights" or "control"
     (four)."""
     free = () if known == "heights" else ("k3", "k5", "p1", "p2")
@@ -225,7 +225,7 @@ def film_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, kno
     return simulated(rng, Optics(camera, lens, 115.0, 0.005), exteriors, films, make_points(xyz, known))
 
 
-def digital_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, known: str) -> Scene:
+def digital_scene(rng: np.random.Generator, exteriors: list[Array], xyz: Array, known: str) -> StartScene:
     """Scene of a digital camera of 8 mm with "fixed" or "unknown" object points."""
     nothing = Prior(0.0, np.inf)
     camera = Camera("K", Prior(8.0, np.inf), nothing, nothing, Distortion("brown", {"k1": nothing, "k2": nothing}))
@@ -251,7 +251,7 @@ def simulated(
     exteriors: list[Array],
     films: list[Film],
     points: list[tuple[ObjectPoint, Array]],
-) -> Scene:
+) -> StartScene:
     """Simulate observations, with errors, of the points that at least two images show."""
     xyz = np.array([place for _, place in points])
     pairs = list(zip(exteriors, films, strict=True))
@@ -276,7 +276,7 @@ def simulated(
     first = kept[0][0]
     held = all(prior is not None and prior.sigma == 0 for prior in (first.X, first.Y, first.Z))
     network = Network((optics.camera,), images, tuple(point for point, _ in kept), observations)
-    return Scene(network, truth, Options(datum="control" if held else "minimal"))
+    return StartScene(network, truth, Options(datum="control" if held else "minimal"))
 
 
 def exposed(optics: Optics, image: str, exterior: Array, film: Film, xyz: Array) -> list[Row]:

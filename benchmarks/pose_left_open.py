@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.harness import Row, table
-from benchmarks.search_frames import FRAME_MM, GIVEN_SIGMA_MM, PITCH_UM, Case, draw_case, make_case
+from benchmarks.search_frames import FRAME_MM, GIVEN_SIGMA_MM, PITCH_UM, SearchCase, draw_case, make_case
 from measure.fiducials.across_frames import check_frames
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
@@ -59,7 +59,7 @@ def case(frame: int, seed: int, pitch_um: float = PITCH_UM, auto: bool = False) 
     return compared(some_case(seed, frame, pitch_um), auto)
 
 
-def some_case(seed: int, index: int, pitch_um: float) -> Case:
+def some_case(seed: int, index: int, pitch_um: float) -> SearchCase:
     """Draw a frame: a third as in the study of the search, a third with solid marks at the frame's border, and a third
     with marks that reach into it."""
     group = index // DRAWN % 3
@@ -104,7 +104,7 @@ def solid_layout(rng: np.random.Generator, outline: Outline, at_mm: float, uneve
     return FiducialLayout(tuple(marks), (FRAME_MM, FRAME_MM))
 
 
-def compared(case: Case, only_auto: bool) -> Row:
+def compared(case: SearchCase, only_auto: bool) -> Row:
     """Compare the marks found with automatic pose, with the true pose, and with the pose chosen by auto given."""
     auto = measure_frame(case, "auto")
     taken = auto.pose.name if auto.pose else case.pose
@@ -125,7 +125,7 @@ def compared(case: Case, only_auto: bool) -> Row:
     }
 
 
-def measure_frame(case: Case, pose: str) -> FrameMeasurement:
+def measure_frame(case: SearchCase, pose: str) -> FrameMeasurement:
     """Measure a frame as `reseau measure` does the only frame of a camera, with marks of unspecified polarity, as drawn
     by a user."""
     pitch = None if case.pitch_um is None else (case.pitch_um, case.pitch_um)
@@ -136,7 +136,7 @@ def measure_frame(case: Case, pose: str) -> FrameMeasurement:
     return check_frames([frame], layout, [pitch or (found_um, found_um)]).frames[0]
 
 
-def sigmas_off(case: Case, frame: FrameMeasurement, status: str) -> list[float]:
+def sigmas_off(case: SearchCase, frame: FrameMeasurement, status: str) -> list[float]:
     """Errors, in claimed sigmas, of the marks of a status, each from the nearest true place."""
     truth = np.array(list(case.centers_px.values()))
     return [sigmas(mark, truth) for mark in frame.marks if mark.status == status]
@@ -155,7 +155,7 @@ def other_statuses(one: FrameMeasurement, other: FrameMeasurement) -> int:
     return max(abs(counts[0][status] - counts[1][status]) for status in ("measured", "weak"))
 
 
-def right(case: Case, frame: FrameMeasurement) -> list[np.ndarray]:
+def right(case: SearchCase, frame: FrameMeasurement) -> list[np.ndarray]:
     """Places of the marks found that coincide with true marks, whatever their names."""
     truth = np.array(list(case.centers_px.values()))
     return [place for place in observed_places(frame) if np.hypot(*(truth - place).T).min() < SAME_PX]

@@ -96,7 +96,7 @@ FAULTS = (
 
 
 @dataclass(frozen=True)
-class Truth:
+class PlantedTruth:
     """True values of a frame. px: place of each mark by name; visible: names of the visible marks."""
 
     pose: str
@@ -105,7 +105,7 @@ class Truth:
 
 
 @dataclass
-class Session:
+class BrowserSession:
     """Statistics of a review. marks: number of decisions on marks; keys_of_marks: keys pressed for them."""
 
     keys: int = 0
@@ -120,7 +120,11 @@ def case(seed: int, folder: Path | None = None) -> Row:
     with nullcontext(folder) if folder else TemporaryDirectory() as place:
         folder = Path(place)
         folder.mkdir(parents=True, exist_ok=True)
-        truths, project, session = planted(folder, np.random.default_rng(seed)), folder / "project.toml", Session()
+        truths, project, session = (
+            planted(folder, np.random.default_rng(seed)),
+            folder / "project.toml",
+            BrowserSession(),
+        )
         reseau("measure", project)
         before = rows(folder)
         for _ in range(ROUNDS):
@@ -148,7 +152,7 @@ def report(rows: Sequence[Row]) -> Iterator[str]:
         yield from (f"{name}: {value}" for name, value in row.items())
 
 
-def is_right(row: Mapping[str, str], truth: Truth) -> bool:
+def is_right(row: Mapping[str, str], truth: PlantedTruth) -> bool:
     """Whether a visible mark is measured at its place, or an invisible one is not an observation."""
     is_observation = row["status"] in ("measured", "weak")
     if row["point"] not in truth.visible or not is_observation:
@@ -161,7 +165,7 @@ def is_right(row: Mapping[str, str], truth: Truth) -> bool:
 # --- the frames
 
 
-def planted(folder: Path, rng: np.random.Generator) -> dict[str, Truth]:
+def planted(folder: Path, rng: np.random.Generator) -> dict[str, PlantedTruth]:
     """Render the project with faults in random frames; returns the true values."""
     at = dict(zip(rng.permutation(FRAMES)[: len(FAULTS)].tolist(), FAULTS, strict=True))
     faults = {f"f{k:02}": at.get(k, Fault("none", turn_rad=float(rng.uniform(-0.01, 0.01)))) for k in range(FRAMES)}
@@ -179,7 +183,7 @@ def planted(folder: Path, rng: np.random.Generator) -> dict[str, Truth]:
         for n, xy in PLACES.items()
     )
     camera = scene.SceneCamera("K", (16.0, 16.0), 30.0, fiducials=fiducials)
-    scanner = scene.Scanner((PITCH_UM, PITCH_UM), margin_mm=3.5, noise=0.004)
+    scanner = scene.SceneScanner((PITCH_UM, PITCH_UM), margin_mm=3.5, noise=0.004)
     field_ = scene.DiskField((), 1.0)
     made = scene.Scene("faults", 3, camera, field_, images, scanner, background="terrain", pad_mm=1.6)
     render_scene(made, folder)
@@ -193,7 +197,7 @@ def planted(folder: Path, rng: np.random.Generator) -> dict[str, Truth]:
         px = {id: np.array([one["col_px"], one["row_px"]]) for id, one in summary[name]["fiducials"].items()}
         plant(folder / "scans" / f"{name}.tif", fault, px, rng)
         gone = {str(fault.mark)} if fault.kind in ("hidden", "false mark", "missing") else set()
-        truths[name] = Truth(fault.pose, px, frozenset(px.keys() - gone))
+        truths[name] = PlantedTruth(fault.pose, px, frozenset(px.keys() - gone))
     return truths
 
 
@@ -236,7 +240,7 @@ def plant(path: Path, fault: Fault, px: Mapping[str, Array], rng: np.random.Gene
 # --- the reviewer
 
 
-def reviewed(project: Path, truths: Mapping[str, Truth], session: Session) -> int:
+def reviewed(project: Path, truths: Mapping[str, PlantedTruth], session: BrowserSession) -> int:
     """Answer all questions of the queue; returns the number of answers."""
     with served_page(project) as (page, address, _):
         page.goto(address)
@@ -255,8 +259,8 @@ class Person:
     """Simulated reviewer with a keyboard, who knows the true places of the marks."""
 
     page: Page
-    truths: Mapping[str, Truth]
-    session: Session
+    truths: Mapping[str, PlantedTruth]
+    session: BrowserSession
 
     def answers(self) -> None:
         self.page.wait_for_function(_READY)
@@ -272,7 +276,7 @@ class Person:
             self.session.marks += 1
             self.session.keys_of_marks += self.session.keys - before
 
-    def judges(self, point: str, truth: Truth) -> None:
+    def judges(self, point: str, truth: PlantedTruth) -> None:
         measured, place = self.page.evaluate(_SHOWN), truth.px[point]
         if measured and point in truth.visible and np.hypot(*(np.array(measured) - place)) < SEEN_PX:
             self.press("a", "accept")
@@ -282,7 +286,7 @@ class Person:
         else:
             self.press("n" if self.page.is_disabled("#reject") else "r", "reject or not there")
 
-    def shows_frame(self, truth: Truth) -> None:
+    def shows_frame(self, truth: PlantedTruth) -> None:
         for number in ("1", "2", "4"):
             self.press(number)
             for view in ("whole", "near"):

@@ -38,7 +38,7 @@ from benchmarks.large_networks import (
     FOCAL_MM,
     FRAME_MM,
     SIGMA_MM,
-    Scene,
+    LargeScene,
     make_board,
     strip,
     unknown,
@@ -85,7 +85,7 @@ def case(case: str, program: str, images: int, points: int = 0, flat: bool = Fal
         "strip": lambda: strip(images, CONTROL_EVERY),
         "hanging strip": lambda: strip(images, 0),
     }[case]()
-    programs: dict[str, Callable[[Scene], Figures]] = {
+    programs: dict[str, Callable[[LargeScene], Figures]] = {
         "reseau": reseau_from_points if case == "free" else reseau,
         "opencv": lambda scene: opencv(scene, free=case == "free", flat=flat),
         "scipy": scipy,
@@ -118,7 +118,7 @@ def _peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def reseau(scene: Scene) -> Figures:
+def reseau(scene: LargeScene) -> Figures:
     """Measure reseau with the covariance of camera, images and points; residuals, tests and reliability separately."""
     result, seconds = _timed(lambda: adjust(scene.network, scene.start))
     assert result.converged
@@ -132,7 +132,7 @@ def reseau(scene: Scene) -> Figures:
     return figures | {"tests_seconds": tests, "mib_with_tests": _peak_mib()}
 
 
-def reseau_from_points(scene: Scene, c: Prior | None = None, options: Options | None = None) -> Figures:
+def reseau_from_points(scene: LargeScene, c: Prior | None = None, options: Options | None = None) -> Figures:
     """Measure approximate values and adjustment with only the points given, and a principal distance or not even
     that."""
     cameras = tuple(replace(each, principal_distance_mm=c, x0_mm=None, y0_mm=None) for each in scene.network.cameras)
@@ -146,7 +146,7 @@ def reseau_from_points(scene: Scene, c: Prior | None = None, options: Options | 
     return {"cpu_seconds": seconds, "mib": _peak_mib(), "vpv": result.vpv, "c_mm": result.value("IO.K.c")}
 
 
-def opencv(scene: Scene, free: bool, flat: bool) -> Figures:
+def opencv(scene: LargeScene, free: bool, flat: bool) -> Figures:
     """Measure OpenCV's calibration with its standard deviations. free: without a principal distance, or with a wrong
     one for points in relief, which require one."""
     cv2.setNumThreads(1)
@@ -162,7 +162,7 @@ def opencv(scene: Scene, free: bool, flat: bool) -> Figures:
     return {"cpu_seconds": seconds, "mib": _peak_mib(), "vpv": vpv, "c_mm": float(found[1][0, 0]) / PIXELS_PER_MM}
 
 
-def pixels_of_images(scene: Scene) -> list[Array]:
+def pixels_of_images(scene: LargeScene) -> list[Array]:
     """Pixel coordinates (m, 2) of the marks of each image, y down."""
     return [(places * (1.0, -1.0) + FRAME_MM / 2) * PIXELS_PER_MM for _, places in scene.visible]
 
@@ -170,7 +170,7 @@ def pixels_of_images(scene: Scene) -> list[Array]:
 class SparseProblem:
     """Residuals of a scene and their analytic sparse Jacobian, in SciPy's form."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: LargeScene) -> None:
         exterior = np.full(6, np.inf)
         exterior[3:] = 1e6  # nearly free, so that angles are additive unknowns
         images = tuple(
@@ -206,7 +206,7 @@ class SparseProblem:
         return np.asarray(factor.solve(unit))
 
 
-def scipy(scene: Scene) -> Figures:
+def scipy(scene: LargeScene) -> Figures:
     """Measure SciPy: trust region with LSMR and the analytic sparse Jacobian, then the covariance of the camera."""
     problem = SparseProblem(scene)
     begin = time.process_time()
@@ -231,7 +231,7 @@ def scipy(scene: Scene) -> Figures:
     }  # fmt: skip
 
 
-def ceres(scene: Scene) -> Figures:
+def ceres(scene: LargeScene) -> Figures:
     """Measure COLMAP's bundle adjustment by Ceres, with the covariance of camera, images and points by the Schur
     complement."""
     import pycolmap

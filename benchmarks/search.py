@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from benchmarks.harness import Row, table
-from benchmarks.search_frames import KINDS, SYMMETRIES, Case, draw_case
+from benchmarks.search_frames import KINDS, SYMMETRIES, SearchCase, draw_case
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.flags import Status
@@ -29,7 +29,7 @@ def case(frame: int, seed: int) -> Row:
     return judge_case(draw_case(seed, frame))
 
 
-def judge_case(case: Case) -> Row:
+def judge_case(case: SearchCase) -> Row:
     """Measure a frame and compare it with the true values."""
     begin = time.perf_counter()
     result = measure_case(case)
@@ -52,12 +52,12 @@ def judge_case(case: Case) -> Row:
     }
 
 
-def measure_case(case: Case) -> FrameMeasurement:
+def measure_case(case: SearchCase) -> FrameMeasurement:
     pitch = None if case.pitch_um is None else (case.pitch_um, case.pitch_um)
     return measure_fiducials(case.scan, case.layout, pitch, FiducialOptions())
 
 
-def is_wrong(case: Case, mark: MarkMeasurement, result: FrameMeasurement) -> bool:
+def is_wrong(case: SearchCase, mark: MarkMeasurement, result: FrameMeasurement) -> bool:
     """Whether a mark is not at the true place of its name; with an assumed pose, not at that of any mark."""
     assert mark.center_px is not None
     assert mark.covariance_px2 is not None
@@ -71,7 +71,7 @@ def is_wrong(case: Case, mark: MarkMeasurement, result: FrameMeasurement) -> boo
     return float(np.hypot(*error)) > WRONG_PX and sigmas > WRONG_SIGMAS
 
 
-def outcome(case: Case, marks: dict[str, MarkMeasurement], observed: set[str], wrong: Sequence[str]) -> str:
+def outcome(case: SearchCase, marks: dict[str, MarkMeasurement], observed: set[str], wrong: Sequence[str]) -> str:
     if any(marks[id].status is Status.MEASURED for id in wrong):
         return "WRONG"
     if wrong:
@@ -81,7 +81,7 @@ def outcome(case: Case, marks: dict[str, MarkMeasurement], observed: set[str], w
     return "all marks" if len(observed) == len(marks) - len(case.hidden) else "some marks"
 
 
-def pose_outcome(case: Case, result: FrameMeasurement) -> str:
+def pose_outcome(case: SearchCase, result: FrameMeasurement) -> str:
     if result.pose is None or not result.pose.decided:
         return "assumed"
     return "right" if result.pose.name == case.pose else "WRONG"

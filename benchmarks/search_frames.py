@@ -34,10 +34,10 @@ from synthetic_images.scene import (
     POSES,
     Background,
     DrawnMark,
-    Film,
-    Scanner,
     Scene,
     SceneFiducial,
+    SceneFilm,
+    SceneScanner,
     Side,
     Tones,
 )
@@ -58,7 +58,7 @@ SIDES: tuple[Side, ...] = ("left", "right", "top", "bottom")
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class SearchCase:
     """Frame with its true values.
 
     Attributes
@@ -82,7 +82,7 @@ class Case:
     without_marks: Callable[[], Array]
 
 
-def draw_case(seed: int, index: int, pitch_um: float = PITCH_UM) -> Case:
+def draw_case(seed: int, index: int, pitch_um: float = PITCH_UM) -> SearchCase:
     """Frame number index of the study with that seed."""
     rng = np.random.default_rng([seed, index])
     kind, symmetry = str(rng.choice(KINDS)), str(rng.choice(SYMMETRIES))
@@ -98,7 +98,7 @@ def make_case(
     tones: Tones | None = None,
     gamma: float = 1.0,
     pitch_um: float = PITCH_UM,
-) -> Case:
+) -> SearchCase:
     """Make a frame with the marks of the layout, everything else random. tones: of marks that are connected to the
     frame's border, without pads behind them; None: random. gamma: tone curve of the scanner."""
     of_border, (tones, picture) = tones is not None, (tones, "solid marks") if tones else _tones(rng)
@@ -110,7 +110,7 @@ def make_case(
     uncovered = tuple(replace(image, covered=()) for image in scene.images)
     bare = replace(scene, camera=replace(scene.camera, fiducials=()), images=uncovered)
     grey, positions = painted(scene, *clutter), truth.fiducials
-    return Case(
+    return SearchCase(
         kind=kind,
         symmetry=symmetry,
         picture=picture + (", negative" if scene.scanner.negative else ""),
@@ -195,14 +195,14 @@ def _scene(rng: Generator, layout: FiducialLayout, tones: Tones) -> Scene:
         FRAME_MM,
         fiducials,
         image,
-        scanner=Scanner(
+        scanner=SceneScanner(
             (PITCH_UM, PITCH_UM),
             margin_mm=MARGIN_MM,
             blur_px=float(rng.uniform(0.6, 1.4)),
             noise=0.01,
             negative=bool(rng.random() < 0.3),
         ),
-        film=Film(
+        film=SceneFilm(
             deformation_um=FILM_UM, grain=float(rng.uniform(0.0, 0.02)), grain_px=1.0, dust=30, scratches=3, hairs=3
         ),
         tones=tones,

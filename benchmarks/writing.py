@@ -29,9 +29,9 @@ from measure.scans.metadata import NO_TAGS
 from measure.scans.scan import Scan
 from synthetic_images.scene import (
     Background,
-    Film,
-    Scanner,
     Scene,
+    SceneFilm,
+    SceneScanner,
     Tones,
     Writing,
 )
@@ -196,7 +196,7 @@ def scene(rng: Generator, marks: tuple[LayoutMark, ...], lines: tuple[Writing, .
         neighbour=SIDES[rng.integers(4)] if not lines and rng.random() < 0.5 else None,
         writing=lines,
     )
-    scanner = Scanner(
+    scanner = SceneScanner(
         (PITCH_UM, PITCH_UM),
         margin_mm=MARGIN_MM,
         blur_px=float(rng.uniform(0.5, 1.2)),
@@ -210,7 +210,9 @@ def scene(rng: Generator, marks: tuple[LayoutMark, ...], lines: tuple[Writing, .
         make_fiducials(marks),
         image,
         scanner=scanner,
-        film=Film(deformation_um=3.0, grain=float(rng.uniform(0.0, 0.03)), grain_px=1.0, dust=30, scratches=3, hairs=3),
+        film=SceneFilm(
+            deformation_um=3.0, grain=float(rng.uniform(0.0, 0.03)), grain_px=1.0, dust=30, scratches=3, hairs=3
+        ),
         tones=Tones(background=float(rng.uniform(0.25, 0.5)), contrast=float(rng.uniform(0.04, 0.12))),
         background=get_args(Background)[rng.integers(3)],
         pad_mm=1.4,

@@ -58,14 +58,14 @@ def report(folder: Path) -> None:
     picture.save(DOCS / "report.png", pnginfo=comment, optimize=True)
 
 
-def archive(folder: Path) -> tuple[Path, Mapping[str, review_faults.Truth]]:
+def archive(folder: Path) -> tuple[Path, Mapping[str, review_faults.PlantedTruth]]:
     """A project with a frame for each fault, not measured yet, and its true values."""
     review_faults.FRAMES = FRAMES
     truths = review_faults.planted(folder / "archive", np.random.default_rng(1))
     return folder / "archive" / "project.toml", truths
 
 
-def box_of_scans(folder: Path) -> tuple[Path, Mapping[str, review_faults.Truth]]:
+def box_of_scans(folder: Path) -> tuple[Path, Mapping[str, review_faults.PlantedTruth]]:
     """Four scans of the archive that show all marks, in a project without a camera."""
     project, truths = archive(folder)
     names = [_frame(truths, kind) for kind in ("turned", "mirrored", "pose hidden", "doubtful")]
@@ -107,7 +107,7 @@ def review(folder: Path) -> None:
         _take(page, "review-frame")
 
 
-def _frame(truths: Mapping[str, review_faults.Truth], kind: str) -> str:
+def _frame(truths: Mapping[str, review_faults.PlantedTruth], kind: str) -> str:
     """The first frame in which `planted` put a fault of a kind."""
     order: list[int] = np.random.default_rng(1).permutation(FRAMES).tolist()
     kinds = dict(zip(order, (fault.kind for fault in review_faults.FAULTS), strict=True))
@@ -125,9 +125,9 @@ def learn(folder: Path) -> None:
         _take(page, "review-learn")
 
 
-def _click_marks(page: Page, truth: review_faults.Truth, numbers: str) -> None:
+def _click_marks(page: Page, truth: review_faults.PlantedTruth, numbers: str) -> None:
     """Click marks by keys, and measure by them."""
-    person = review_faults.Person(page, {}, review_faults.Session())
+    person = review_faults.Person(page, {}, review_faults.BrowserSession())
     expect(page.locator("#whole")).to_be_focused()
     for number in numbers:
         page.keyboard.press(number)

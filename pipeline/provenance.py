@@ -117,7 +117,7 @@ class FileState(NamedTuple):  # a tuple, since archives have many
 
 
 @dataclass(frozen=True)
-class Identity:
+class FileIdentity:
     """State of a file, and SHA-256 of parts of its content (`parts_hash`)."""
 
     state: FileState
@@ -205,7 +205,7 @@ def alike_groups(items: Iterable[Item], *values: Callable[[Item], object]) -> li
     return groups
 
 
-def result_key(identity: Identity, options_hash: str, revision: int = MEASURE_REVISION) -> str:
+def result_key(identity: FileIdentity, options_hash: str, revision: int = MEASURE_REVISION) -> str:
     """SHA-256 (hexadecimal) of a scan's identity, the hash of its options, and the revision of `measure`. It is the
     same on every machine, so results can be merged."""
     return hash_text(json.dumps([*identity.state, identity.parts_hash, options_hash, revision]))

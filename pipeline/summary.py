@@ -17,9 +17,9 @@ from measure.flags import Status
 from measure.results import ScanOrientation
 from pipeline.archive.status import NAMED, ArchiveStatus, worst_named
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_counts
-from pipeline.report.data import Problem, ReportData, current_scans
+from pipeline.report.data import ReportData, ReportedProblem, current_scans
 from pipeline.report.data import frames as report_frames
-from pipeline.report.fiducials import Distance, correction_sentence, figure
+from pipeline.report.fiducials import MarkDistance, correction_sentence, figure
 from pipeline.report.load import frame_counts
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.parameters import CameraValue, camera_values
@@ -60,7 +60,7 @@ class Summary:
     adjustment: AdjustmentRecord | None
     check: Check | None
     files: Mapping[str, Path] = field(default_factory=dict)
-    corrections: Mapping[str, tuple[str, Sequence[Distance]]] = field(default_factory=dict)
+    corrections: Mapping[str, tuple[str, Sequence[MarkDistance]]] = field(default_factory=dict)
     values: Mapping[str, Sequence[CameraValue]] = field(default_factory=dict)
     unit: ImageUnit = FILM_UNIT
     verdicts: Mapping[Verdict, int] = field(default_factory=dict)
@@ -98,7 +98,7 @@ def summarise(data: ReportData, files: Mapping[str, Path]) -> Summary:
     of_frames = data.totals.marks if data.totals else marks
     stored, covariance = data.adjustment, data.covariance
     cameras = stored.cameras if stored else {}
-    corrections = dict[str, tuple[str, Sequence[Distance]]]()
+    corrections = dict[str, tuple[str, Sequence[MarkDistance]]]()
     if stored is not None and covariance is not None and stored.converged:
         for name, camera in cameras.items():
             if not camera.is_calibrated and (form := figure(name, stored, covariance)) is not None:
@@ -214,10 +214,10 @@ def _quality(adjustment: AdjustmentRecord) -> str:
 def archive_summary(status: ArchiveStatus, files: Mapping[str, Path]) -> Summary:
     """Summary of a measurement of many scans."""
     named, more = worst_named(status.scans, NAMED, False)
-    problems = [Problem(f"{scan.image}: {scan.verdict}: {scan.why}", NEXT_STEP[scan.verdict]) for scan in named]
-    problems += [Problem(f"decisions.jsonl, {line}", "It does not count.") for line in status.idle_decisions]
+    problems = [ReportedProblem(f"{scan.image}: {scan.verdict}: {scan.why}", NEXT_STEP[scan.verdict]) for scan in named]
+    problems += [ReportedProblem(f"decisions.jsonl, {line}", "It does not count.") for line in status.idle_decisions]
     if more:
-        problems.append(Problem(f"{more} more need a look.", "Run `reseau status` with --verdict or --csv."))
+        problems.append(ReportedProblem(f"{more} more need a look.", "Run `reseau status` with --verdict or --csv."))
     level: Level = "good" if status.all_good else "look"
     verdict = ReportVerdict(level, f"{status.sentence}.", tuple(problems), ())
     return Summary(verdict, {}, {}, None, None, files, verdicts=status.counts)

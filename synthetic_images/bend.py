@@ -15,7 +15,7 @@ STEPS = 12  # iterations of the inversion; each reduces the error by a factor of
 
 
 @dataclass(frozen=True)
-class Bend:
+class ScannerBend:
     """Geometric error of a scanner.
 
     Attributes

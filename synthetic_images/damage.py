@@ -5,14 +5,14 @@ from numpy.typing import NDArray
 
 from synthetic_images.areas import Area, stroke
 from synthetic_images.film import turn
-from synthetic_images.scene import Film
+from synthetic_images.scene import SceneFilm
 
 Array = NDArray[np.float64]
 
 DUST_VERTICES = 12
 
 
-def damage(film: Film, width_px: int, height_px: int, generator: np.random.Generator) -> list[tuple[Area, float]]:
+def damage(film: SceneFilm, width_px: int, height_px: int, generator: np.random.Generator) -> list[tuple[Area, float]]:
     """Defects of one frame: area in (column, row) and tone; dust and hairs are dark, scratches light."""
     size = np.array([width_px, height_px], float)
     dust = [(_speck(size, generator), 0.0) for _ in range(film.dust)]

@@ -6,7 +6,7 @@ OpenCV's models, which distort the ray itself, are in `projection`.
 import numpy as np
 from numpy.typing import NDArray
 
-from synthetic_images.scene import PARAMETERS, Distortion
+from synthetic_images.scene import PARAMETERS, SceneDistortion
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -15,7 +15,7 @@ MM_PER_DM = 100.0
 JUHL_UNIT = 1e-5  # dm, 1 µm
 
 
-def correction(distortion: Distortion, reduced: ComplexArray, point: Array) -> ComplexArray:
+def correction(distortion: SceneDistortion, reduced: ComplexArray, point: Array) -> ComplexArray:
     """(n, 2) correction, mm: ideal = observed - correction, evaluated at the observed point; for aicon at the ideal
     one.
 
@@ -26,7 +26,9 @@ def correction(distortion: Distortion, reduced: ComplexArray, point: Array) -> C
     return families[distortion.family](distortion, value, reduced, point)
 
 
-def _torlegard(distortion: Distortion, value: dict[str, float], reduced: ComplexArray, point: Array) -> ComplexArray:
+def _torlegard(
+    distortion: SceneDistortion, value: dict[str, float], reduced: ComplexArray, point: Array
+) -> ComplexArray:
     x, y = reduced.T
     r2, zero2 = x * x + y * y, distortion.r0_mm**2
     radial = value["k3"] * (r2 - zero2) + value["k5"] * (r2**2 - zero2**2) + value["k7"] * (r2**3 - zero2**3)
@@ -38,7 +40,7 @@ def _torlegard(distortion: Distortion, value: dict[str, float], reduced: Complex
     return np.stack([dx, dy], axis=1)
 
 
-def _brown(_: Distortion, value: dict[str, float], reduced: ComplexArray, __: Array) -> ComplexArray:
+def _brown(_: SceneDistortion, value: dict[str, float], reduced: ComplexArray, __: Array) -> ComplexArray:
     x, y = reduced.T
     r2 = x * x + y * y
     radial = r2 * (value["k1"] + r2 * (value["k2"] + r2 * value["k3"]))
@@ -47,7 +49,7 @@ def _brown(_: Distortion, value: dict[str, float], reduced: ComplexArray, __: Ar
     return np.stack([dx, dy], axis=1)
 
 
-def _australis(_: Distortion, value: dict[str, float], reduced: ComplexArray, __: Array) -> ComplexArray:
+def _australis(_: SceneDistortion, value: dict[str, float], reduced: ComplexArray, __: Array) -> ComplexArray:
     """The published terms are added to the observed point, hence the sign."""
     x, y = reduced.T
     r2 = x * x + y * y
@@ -57,7 +59,7 @@ def _australis(_: Distortion, value: dict[str, float], reduced: ComplexArray, __
     return np.stack([-dx, -dy], axis=1)
 
 
-def _aicon(distortion: Distortion, value: dict[str, float], reduced: ComplexArray, _: Array) -> ComplexArray:
+def _aicon(distortion: SceneDistortion, value: dict[str, float], reduced: ComplexArray, _: Array) -> ComplexArray:
     """The published terms are added to the ideal point, which `reduced` is here."""
     x, y = reduced.T
     r2, zero2 = x * x + y * y, distortion.r0_mm**2
@@ -67,7 +69,7 @@ def _aicon(distortion: Distortion, value: dict[str, float], reduced: ComplexArra
     return np.stack([-dx, -dy], axis=1)
 
 
-def _juhl(distortion: Distortion, value: dict[str, float], reduced: ComplexArray, point: Array) -> ComplexArray:
+def _juhl(distortion: SceneDistortion, value: dict[str, float], reduced: ComplexArray, point: Array) -> ComplexArray:
     """Program sANA: relative to the camera's origin, in dm; terms added to the observed point."""
     x, y = np.asarray((reduced + point).T / MM_PER_DM, np.complex128)
     r0 = distortion.r0_mm / MM_PER_DM

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synthetic_images.areas import Area
-from synthetic_images.bend import Bend
+from synthetic_images.bend import ScannerBend
 from synthetic_images.projection import camera_from_object
-from synthetic_images.scene import Film, Scene, SceneImage, TakingLens
+from synthetic_images.scene import Scene, SceneFilm, SceneImage, SceneTakingLens
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class FrameGeometry:
         lens = self.scene.scanner.lens
         return pixels if lens is None else self._distort(lens, pixels)
 
-    def _distort(self, lens: TakingLens, pixels: Array) -> Array:
+    def _distort(self, lens: SceneTakingLens, pixels: Array) -> Array:
         """Distort ideal pixel coordinates (n, 2) by the taking lens (OpenCV's formulas)."""
         middle = (self.width_px - 1) / 2, (self.height_px - 1) / 2
         center = np.asarray(lens.center_px or middle)
@@ -91,7 +91,7 @@ class FrameGeometry:
         return np.asarray(np.sin(camera_mm @ self.waves_per_mm.T + self.phases_rad) @ self.amplitudes_mm)
 
     @cached_property
-    def bend(self) -> Bend:
+    def bend(self) -> ScannerBend:
         return scanner_bend(self.scene)
 
     @cached_property
@@ -143,7 +143,7 @@ def frame_geometry(scene: Scene, index: int) -> FrameGeometry:
     )
 
 
-def photograph_from_film(film: Film) -> Array:
+def photograph_from_film(film: SceneFilm) -> Array:
     """(3, 3) homography of a film photographed at its own scale by a camera tilted around a line in the film."""
     tilt_rad, direction = np.deg2rad(film.tilt_deg), turn(np.deg2rad(film.tilt_direction_deg))
     tilted = np.diag([np.cos(tilt_rad), 1.0, 1.0])
@@ -158,10 +158,10 @@ def _projected(matrix: Array, points: Array) -> Array:
     return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:], np.float64)
 
 
-def scanner_bend(scene: Scene) -> Bend:
+def scanner_bend(scene: Scene) -> ScannerBend:
     """Geometric error of the scene's scanner, over a square bed that holds the scans of all frames in any
     orientation."""
-    return Bend(scene.scanner.bend_um, max(scene.camera.frame_mm) + 2 * scene.scanner.margin_mm)
+    return ScannerBend(scene.scanner.bend_um, max(scene.camera.frame_mm) + 2 * scene.scanner.margin_mm)
 
 
 def turn(angle_rad: float) -> Array:

@@ -40,7 +40,7 @@ BOARD_WHITE, BOARD_BLACK = 0.8, 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class RenderedFrame:
     """Frame to be painted. exposed: exposed parts of the scan; paints: objects on top of them, in painting order."""
 
     truth: FrameTruth
@@ -48,7 +48,7 @@ class Frame:
     paints: tuple[Paint, ...]
 
 
-def make_frame(scene: Scene, index: int) -> Frame:
+def make_frame(scene: Scene, index: int) -> RenderedFrame:
     """Make the content of one frame, ready to be painted."""
     truth = frame_truth(scene, index)
     geometry = truth.geometry
@@ -58,7 +58,7 @@ def make_frame(scene: Scene, index: int) -> Frame:
     paints = [*_field_paints(geometry, truth.targets), *_fiducial_paints(geometry)]
     paints += [_written(writing, geometry) for writing in geometry.image.writing]
     paints += [AreaPaint((area,), tone) for area, tone in defects]
-    return Frame(truth, exposed, tuple(paints))
+    return RenderedFrame(truth, exposed, tuple(paints))
 
 
 def frame_truth(scene: Scene, index: int) -> FrameTruth:

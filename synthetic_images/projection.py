@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synthetic_images.distortion import correction
-from synthetic_images.scene import Distortion, SceneCamera
+from synthetic_images.scene import SceneCamera, SceneDistortion
 
 Array = NDArray[np.float64]
 
@@ -78,7 +78,7 @@ def ray_from_camera(camera: SceneCamera, exterior: tuple[float, ...], camera_mm:
     return np.asarray(rays @ object_rotation(*exterior[3:]))
 
 
-def _opencv_ideal(distortion: Distortion, tangents: Array) -> Array:
+def _opencv_ideal(distortion: SceneDistortion, tangents: Array) -> Array:
     """Inverse of `_opencv_distorted`, by OpenCV's iteration."""
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 4 * INVERSION_STEPS, 1e-14)
     distorted = np.linalg.solve(_axes(distortion), tangents.T).T.reshape(-1, 1, 2)
@@ -89,7 +89,7 @@ def _opencv_ideal(distortion: Distortion, tangents: Array) -> Array:
     return np.asarray(np.reshape(ideal, (-1, 2)) * [1.0, -1.0], np.float64)
 
 
-def _opencv_distorted(distortion: Distortion, tangents: Array) -> Array:
+def _opencv_distorted(distortion: SceneDistortion, tangents: Array) -> Array:
     """Distort by OpenCV's models, whose y axis points down."""
     is_visible = np.isfinite(tangents).all(axis=1)
     result = np.full_like(tangents, np.nan)
@@ -104,17 +104,17 @@ def _opencv_distorted(distortion: Distortion, tangents: Array) -> Array:
     return result
 
 
-def _coefficients(distortion: Distortion) -> Array:
+def _coefficients(distortion: SceneDistortion) -> Array:
     return np.array([distortion.parameters.get(name, 0.0) for name in OF_THE_RAY[distortion.family]])
 
 
-def _axes(distortion: Distortion) -> Array:
+def _axes(distortion: SceneDistortion) -> Array:
     """(2, 2) matrix from OpenCV's axes to x right, y up, with fx = c (1 + b1) and skew c b2."""
     b1, b2 = (distortion.parameters.get(name, 0.0) for name in ("b1", "b2"))
     return np.array([[1.0 + b1, b2], [0.0, -1.0]])
 
 
-def _inverted(distortion: Distortion, ideal: Array, point: Array) -> Array:
+def _inverted(distortion: SceneDistortion, ideal: Array, point: Array) -> Array:
     """Solve x - correction(x) = ideal for points x, reduced to the principal point, by Newton's method.
 
     Corrections are defined at the observed point, those of aicon at the ideal one: one direction needs inversion.
@@ -137,7 +137,7 @@ def _inverted(distortion: Distortion, ideal: Array, point: Array) -> Array:
     return observed
 
 
-def _corrected(distortion: Distortion, observed: Array, point: Array) -> tuple[Array, Array, Array]:
+def _corrected(distortion: SceneDistortion, observed: Array, point: Array) -> tuple[Array, Array, Array]:
     """Points (n, 2) minus their correction, and its complex-step derivatives with respect to x and y, (n, 2) each."""
     steps = np.concatenate([observed + step for step in 1e-30j * np.eye(2)])
     by_x, by_y = np.split(steps - correction(distortion, steps, point), 2)

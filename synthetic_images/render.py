@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from synthetic_images.background import Background, scene_background
-from synthetic_images.frame import Frame, make_frame
+from synthetic_images.frame import RenderedFrame, make_frame
 from synthetic_images.grain import grain, white_noise
 from synthetic_images.scene import Scene, SceneImage, UnsharpMask
 from synthetic_images.tiff import Grey, write_tiff
@@ -69,7 +69,7 @@ def render_scene(scene: Scene, out_dir: Path, progress: Progress | None = None) 
     return truth
 
 
-def grey_strips(frame: Frame, index: int, background: Background) -> Iterator[Grey]:
+def grey_strips(frame: RenderedFrame, index: int, background: Background) -> Iterator[Grey]:
     """Yield the grey values of the file in strips of STRIP_PX rows: (rows, width) or (rows, width, 3)."""
     geometry, scene = frame.truth.geometry, background.scene
     mask = scene.scanner.sharpen
@@ -84,7 +84,7 @@ def grey_strips(frame: Frame, index: int, background: Background) -> Iterator[Gr
         yield _digitised(codes[row0 - first : end - first], scene)
 
 
-def _painted(frame: Frame, index: int, background: Background, row0: int, height: int) -> Picture:
+def _painted(frame: RenderedFrame, index: int, background: Background, row0: int, height: int) -> Picture:
     """Fractions of full scale, blurred by the scanner's optics and averaged over the area of each pixel."""
     geometry, scene = frame.truth.geometry, background.scene
     window = (row0, height, geometry.width_px, scene.scanner.blur_px)
@@ -148,7 +148,7 @@ def _digitised(channels: Picture, scene: Scene) -> Grey:
     return np.asarray(grey, np.uint16 if scanner.bit_depth == 16 else np.uint8)
 
 
-def _strip_count(frame: Frame) -> int:
+def _strip_count(frame: RenderedFrame) -> int:
     return -(-frame.truth.geometry.height_px // STRIP_PX)
 
 

@@ -40,7 +40,7 @@ PARAMETERS: Mapping[Family, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True)
-class Distortion:
+class SceneDistortion:
     """Distortion model. parameters: by name, 0 if absent; r0_mm: reference radius; decentering: "paper" for Torlegård's
     decentring terms as printed, not reduced to the principal point."""
 
@@ -93,7 +93,7 @@ class SceneCamera:
     frame_mm: Point
     principal_distance_mm: float
     principal_point_mm: Point = (0.0, 0.0)
-    distortion: Distortion = Distortion()
+    distortion: SceneDistortion = SceneDistortion()
     fiducials: tuple[SceneFiducial, ...] = ()
 
     def __post_init__(self) -> None:
@@ -274,7 +274,7 @@ class SceneImage:
 
 
 @dataclass(frozen=True)
-class Film:
+class SceneFilm:
     """Film properties common to all frames.
 
     Attributes
@@ -328,7 +328,7 @@ class UnsharpMask:
 
 
 @dataclass(frozen=True)
-class TakingLens:
+class SceneTakingLens:
     """Lens of a digital camera that takes the scans, by OpenCV's formulas (calib3d, "detailed description").
 
     focal_px: principal distance; center_px: principal point, None for the centre of the image.
@@ -347,7 +347,7 @@ class TakingLens:
 
 
 @dataclass(frozen=True)
-class Scanner:
+class SceneScanner:
     """Scanner and file format.
 
     Attributes
@@ -378,7 +378,7 @@ class Scanner:
     tone: float | str = 1.0
     bend_um: Mapping[str, float] = field(default_factory=dict)
     sharpen: UnsharpMask = UnsharpMask()
-    lens: TakingLens | None = None
+    lens: SceneTakingLens | None = None
 
     def __post_init__(self) -> None:
         positive("pitch_um", *self.pitch_um)
@@ -439,8 +439,8 @@ class Scene:
     camera: SceneCamera
     field: DiskField | BoardField
     images: tuple[SceneImage, ...]
-    scanner: Scanner
-    film: Film = Film()
+    scanner: SceneScanner
+    film: SceneFilm = SceneFilm()
     tones: Tones = Tones()
     background: Background = "plain"
     ground: float = 0.0

@@ -8,7 +8,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from synthetic_images.scene import Compression, Scanner
+from synthetic_images.scene import Compression, SceneScanner
 
 Grey = NDArray[np.unsignedinteger]
 
@@ -16,7 +16,7 @@ JPEG_LEVEL = 92
 
 
 def write_tiff(
-    path: Path, strips: Iterator[Grey], width_px: int, height_px: int, strip_px: int, scanner: Scanner
+    path: Path, strips: Iterator[Grey], width_px: int, height_px: int, strip_px: int, scanner: SceneScanner
 ) -> None:
     """Write strips from top to bottom: (rows, width) or (rows, width, 3), of strip_px rows, fewer in the last one.
 

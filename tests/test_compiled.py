@@ -17,7 +17,7 @@ from adjust.linear_algebra.elimination import SparseBlocks, eliminated
 from adjust.linear_algebra.factor import Blocks
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.sparse_factor import Triangle
-from adjust.linear_algebra.sparse_rows import Pattern, SharedEquations, SparseRows
+from adjust.linear_algebra.sparse_rows import SharedEquations, SparseRows, SparsityPattern
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
 from pipeline.cli import DONE, run
@@ -93,7 +93,7 @@ def sparse_rows(seed: int) -> SparseRows:
     own[5, 2] = own[7, 0] = -1
     single = np.where(rng.random((count, 2)) < 0.9, rng.integers(0, 4, (count, 2)) // 2 * 2 + [0, 1], -1)
     columns = np.arange(3), np.arange(3, 7), np.arange(7, 9)
-    pattern = Pattern(
+    pattern = SparsityPattern(
         columns,
         rng.integers(0, blocks + 1, count),
         rng.integers(0, groups + 1, count),

@@ -18,7 +18,7 @@ from adjust.functional_model.families import family
 from adjust.functional_model.lens import Lens
 from adjust.functional_model.rotation import angles_from_rotation, angles_near, rotation_from_angles
 from adjust.functional_model.transformation import LATTICE, film_kind, fit_transformation
-from adjust.initial_values.model_formation import Block, extend, intersected, known_field, orient_free_model
+from adjust.initial_values.model_formation import BlockState, extend, intersected, known_field, orient_free_model
 from adjust.initial_values.pose import KnownField, Pose, Sight, image_distances
 from adjust.initial_values.resection import FEWEST, find_principal_distance, find_wide_distance, resect_images
 from adjust.problem.camera import Camera
@@ -285,7 +285,7 @@ def orient(
         If a point cannot be intersected.
     """
     firm, rough = (network.coordinates(firm) for firm in (True, False))
-    block = Block(sights, firm, rough, dict(resected))
+    block = BlockState(sights, firm, rough, dict(resected))
     for image in network.images:
         if image.exterior is not None and image.name in sights:
             block.poses[image.name] = _given_or_resected(image.exterior, block, image.name)
@@ -308,7 +308,7 @@ def orient(
     return block.poses, _all_points(block)
 
 
-def _given_or_resected(exterior: Exterior, block: Block, image: str) -> Pose:
+def _given_or_resected(exterior: Exterior, block: BlockState, image: str) -> Pose:
     """The given orientation; a resection instead if known points contradict it and it is not fixed."""
     given = Pose(rotation_from_angles(exterior.values[3:]), exterior.center)
     field, c = known_field(block.sights[image], block.firm), block.sights[image].principal_distance_mm
@@ -321,7 +321,7 @@ def _given_or_resected(exterior: Exterior, block: Block, image: str) -> Pose:
     return found if left_given > CLEARLY_WORSE * max(left_found, block.sights[image].sigma_mm) else given
 
 
-def _all_points(block: Block) -> dict[str, Array]:
+def _all_points(block: BlockState) -> dict[str, Array]:
     """Coordinates of every point: known, else intersected, else the given approximation.
 
     A few whose rays do not meet are placed on a ray, as far away as points are: the mismatches are found later.
@@ -351,7 +351,7 @@ def _all_points(block: Block) -> dict[str, Array]:
     return found
 
 
-def _why_not_oriented(block: Block, image: str) -> str:
+def _why_not_oriented(block: BlockState, image: str) -> str:
     sight = block.sights[image]
     xyz = known_field(sight, {**block.rough, **block.points}).xyz
     remedy = f"measure more known points, or give the orientation of image {image}."

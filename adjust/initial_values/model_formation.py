@@ -265,7 +265,7 @@ def _similarity(rotation: Array, model: Array, known: Array, given: Mask) -> Sim
 
 
 @dataclass
-class Block:
+class BlockState:
     """Images, known coordinates, and the poses and points determined so far, by image and point name."""
 
     sights: Mapping[str, Sight]
@@ -275,7 +275,7 @@ class Block:
     points: dict[str, Array] = field(default_factory=dict)  # intersected
 
 
-def extend(block: Block) -> None:
+def extend(block: BlockState) -> None:
     """Resect images and intersect points in turn until no more can be oriented; images with most control first."""
     while True:
         block.points = intersected(block, WELL_DETERMINED)
@@ -288,7 +288,7 @@ def extend(block: Block) -> None:
         block.poses.update(new)
 
 
-def _resected(block: Block, images: Sequence[str], fewest: int) -> dict[str, Pose]:
+def _resected(block: BlockState, images: Sequence[str], fewest: int) -> dict[str, Pose]:
     """Resect the images that have enough points: from firm points, else from all points with coordinates so far."""
     poses: dict[str, Pose] = {}
     for coordinates in (block.firm, {**block.rough, **block.points}):
@@ -306,7 +306,7 @@ def known_field(sight: Sight, coordinates: Mapping[str, Array]) -> KnownField:
     return KnownField(xyz[usable], sight.xy_mm[usable], sight.sigma_mm)
 
 
-def intersected(block: Block, weakest: float) -> dict[str, Array]:
+def intersected(block: BlockState, weakest: float) -> dict[str, Array]:
     """Intersect the points that are not fully known, with given coordinates fixed.
 
     Returns coordinates (3,) by point, of those with a determination above `weakest`.
@@ -373,7 +373,7 @@ def orient_free_model(sights: Mapping[str, Sight], known: Mapping[str, Array]) -
     }
 
 
-def _models(sights: Mapping[str, Sight]) -> list[Block]:
+def _models(sights: Mapping[str, Sight]) -> list[BlockState]:
     """Models of the pairs of images with most common points, one for each relative orientation, extended by all images
     that can be joined."""
     shown = {image: set(sights[image].points) for image in sorted(sights)}
@@ -387,13 +387,13 @@ def _models(sights: Mapping[str, Sight]) -> list[Block]:
             row = {name: i for i, name in enumerate(sight.points)}
             rays.append(sight.rays[[row[name] for name in common]])
         for pose in relative_poses(rays[0], rays[1], np.random.default_rng(0)):
-            model = Block(sights, nothing, nothing, {first: Pose(np.eye(3), np.zeros(3)), second: pose})
+            model = BlockState(sights, nothing, nothing, {first: Pose(np.eye(3), np.zeros(3)), second: pose})
             extend(model)
             models.append(model)
     return models
 
 
-def typical_residual(model: Block) -> float:
+def typical_residual(model: BlockState) -> float:
     """Median distance in mm between projected and observed points; a point not intersected counts as infinite."""
     distances = []
     for image, pose in model.poses.items():

@@ -15,7 +15,7 @@ from adjust.array_types import Array, Indices
 from adjust.linear_algebra.factor import Blocks
 from adjust.linear_algebra.fronts import Fronts, band_order, make_fronts
 from adjust.linear_algebra.small_matrices import applied, inverse, lower_root, product
-from adjust.linear_algebra.sparse_rows import Pattern, SparseRows
+from adjust.linear_algebra.sparse_rows import SparseRows, SparsityPattern
 from adjust.problem.condition_equations import Derivatives
 from adjust.problem.problem import ABSENT, Problem, State, side_by_side
 
@@ -72,7 +72,7 @@ class Numbering:
         return numbers
 
     @cached_property
-    def pattern(self) -> Pattern | None:
+    def pattern(self) -> SparsityPattern | None:
         """Sparsity pattern of the observations.
 
         None if no images or points are shared, or if frames own unknowns and some are scanned in parts.
@@ -114,7 +114,7 @@ class Numbering:
                 single[column] = numbers
         used, rest = np.array(list(single), dtype=np.intp), np.array(list(single.values()), dtype=np.intp)
         columns = owning[0], grouped[0], used
-        return Pattern(columns, block, group, own, members, rest.reshape(-1, len(block)).T, shared_count)
+        return SparsityPattern(columns, block, group, own, members, rest.reshape(-1, len(block)).T, shared_count)
 
     @cached_property
     def _shared_order(self) -> tuple[Indices, Fronts]:

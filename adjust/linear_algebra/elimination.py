@@ -34,7 +34,7 @@ from adjust.linear_algebra.sparse_factor import (
     reflected,
     reflections_cost,
 )
-from adjust.linear_algebra.sparse_rows import Pattern, SharedEquations, SparseRows, batches, take_columns
+from adjust.linear_algebra.sparse_rows import SharedEquations, SparseRows, SparsityPattern, batches, take_columns
 
 COMPILED_OWN = 3  # largest number of own unknowns per block in kernels.c
 CHEAP = 1e7  # rows times columns squared of the shared unknowns, up to which Householder QR is always used
@@ -46,7 +46,7 @@ SAFE = 1e-6  # reciprocal condition of the shared triangle down to which normal 
 class Border:
     """Border of r rows in the shared unknowns: block-sparse in the groups, and dense (r, t) in the single ones."""
 
-    pattern: Pattern
+    pattern: SparsityPattern
     parts: bsr_array
     alone: Array
 

@@ -17,7 +17,7 @@ ROWS_AT_ONCE = 20_000  # pairs of rows in one batch, which then fits the process
 
 
 @dataclass(frozen=True)
-class Pattern:
+class SparsityPattern:
     """Sparsity pattern of n pairs of rows: unknowns of one of b blocks, of one of g groups, and single ones."""
 
     # own (o,), group (w,), single (c,) columns of the derivatives with respect to these unknowns
@@ -101,7 +101,7 @@ class Pattern:
 class SparseRows:
     """Observation equations in pairs of rows of unit weight, with a sparsity pattern."""
 
-    pattern: Pattern
+    pattern: SparsityPattern
     matrix: Array  # (n, 2, k) derivatives with respect to the unknowns in the pattern
     right: Array  # (n, 2) right sides
     further: tuple[Blocks, ...]  # additional rows in shared unknowns only

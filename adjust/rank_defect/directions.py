@@ -27,7 +27,7 @@ IN_LINE = 1e-3  # width over length of collinear marks, and base over distance o
 SHOWN = 3  # names listed one by one
 
 
-class Reason(NamedTuple):
+class DefectReason(NamedTuple):
     """Why a motion is free; the prior that would fix it; other remedies."""
 
     because: str
@@ -42,11 +42,11 @@ class NamedDirection:
     rank: int  # the lowest one that applies gives the name
     functional: Array  # (n,) function of the unknowns that the direction changes
     motion: str  # what moves, in words
-    reason: Reason  # why, and the remedy
+    reason: DefectReason  # why, and the remedy
     # another unknown, with its words, whose prior would fix the direction if it moves too
     partner: tuple[Parameter, str] | None = None
     # reasons where a lens ("lens") or fiducial marks ("marks") move along
-    by_companion: Mapping[str, Reason] = field(default_factory=dict)
+    by_companion: Mapping[str, DefectReason] = field(default_factory=dict)
 
     def sentence(self, moved: Iterable[Parameter]) -> tuple[str, str]:
         """Cause and remedy, given the unknowns that move."""
@@ -176,7 +176,7 @@ def _fiducial_directions(problem: Problem, state: State, camera: str) -> Iterato
         bent = all(follows_tilts(image.transformation) for image in images) and np.abs(moved).max() >= least_bend
         if rank >= 0 or bent:
             with_partner = partner and (Parameter.interior(camera, partner[0]), partner[1])
-            functional, reason = _functional(problem, marks, moved), Reason("", given, otherwise)
+            functional, reason = _functional(problem, marks, moved), DefectReason("", given, otherwise)
             yield NamedDirection(rank, functional, motion.format(**words), reason, with_partner)
 
 
@@ -186,7 +186,7 @@ def _lens_directions(problem: Problem, state: State, camera: str) -> Iterator[Na
     turned = "add images turned by 180 degrees about their axes"
     of_point = field.remedy if field.known == "points" or field.flat else turned
     for number, motion, given in INTERIOR_MOTIONS:
-        reason = Reason(field.because, given, of_point if number else field.remedy)
+        reason = DefectReason(field.because, given, of_point if number else field.remedy)
         yield NamedDirection(2, _functional(problem, positions[number]), motion.format(camera), reason)
     own_family = family(problem.network.camera_by_name[camera].distortion.family)
     named = dict(zip(own_family.parameters, positions[3:], strict=True))
@@ -197,7 +197,7 @@ def _lens_directions(problem: Problem, state: State, camera: str) -> Iterator[Na
         remedy = f"fix some of {', '.join(free)} at 0"
     for name, position in named.items():
         motion = f"The distortion parameter {name} of camera {camera} can change"
-        reason = Reason(because, name, f"fix it, or {remedy}")
+        reason = DefectReason(because, name, f"fix it, or {remedy}")
         yield NamedDirection(3, _functional(problem, position), motion, reason)
 
 
@@ -256,12 +256,12 @@ def _scanner_directions(problem: Problem, state: State, scanner: str) -> Iterato
         by_companion = dict(zip(("lens", "marks"), others, strict=True))
         if film:
             because = f"the {film} transformation of its films does the same"
-            reason, by_companion = Reason(because, "the term itself", "leave it out"), {}
+            reason, by_companion = DefectReason(because, "the term itself", "leave it out"), {}
         motion = f"The term {term} of the bend of scanner {scanner} can change"
         yield NamedDirection(-2, _functional(problem, position), motion, reason, by_companion=by_companion)
 
 
-def term_reason(term: str, poses: Sequence[Pose], confused_with: str) -> Reason:
+def term_reason(term: str, poses: Sequence[Pose], confused_with: str) -> DefectReason:
     """Why a term of the deformation is not determined, and the remedies.
 
     poses: of the scanner's frames. confused_with: what it is not separable from, "lens" or "marks"; empty where the
@@ -275,11 +275,11 @@ def term_reason(term: str, poses: Sequence[Pose], confused_with: str) -> Reason:
     elif confused_with == "marks" and _are_half_turns(poses):
         otherwise = "scan some of the frames turned by 90 degrees"
     if not confused_with:
-        return Reason("the marks in its scans are too few, or lie too much alike, to show it", given, otherwise)
+        return DefectReason("the marks in its scans are too few, or lie too much alike, to show it", given, otherwise)
     if confused_with == "lens":
         as_they_lie = "however the frames lie" if is_odd or not one_pose else "in frames that all lie alike"
         given = "the distortion, from an earlier calibration say, or to the term itself"
-        return Reason(f"the distortion of a lens does the same {as_they_lie}", given, otherwise)
+        return DefectReason(f"the distortion of a lens does the same {as_they_lie}", given, otherwise)
     if one_pose:
         because = "all frames lie alike in the scanner: its bend and the fiducial marks' places are one and the same"
     elif is_odd and _are_half_turns(poses):
@@ -289,7 +289,7 @@ def term_reason(term: str, poses: Sequence[Pose], confused_with: str) -> Reason:
     else:
         listed = ", ".join(f"{turn}{' mirrored' if mirrored else ''}" for turn, mirrored in poses)
         because = f"it, or its sum with others, is the same in all orientations of the scans ({listed} degrees)"
-    return Reason(because, given, otherwise)
+    return DefectReason(because, given, otherwise)
 
 
 def weak_term_sentences(numbering: Numbering, state: State, factor: Factor, cofactor: Cofactor) -> Iterator[str]:
@@ -325,7 +325,7 @@ def undetermined_term_sentences(
 
     by_lens: terms that would be determined if the distortion were known.
     """
-    by_reason: dict[Reason, list[str]] = {}
+    by_reason: dict[DefectReason, list[str]] = {}
     for term in terms:
         by_reason.setdefault(term_reason(term, poses, "lens" if term in by_lens else "marks"), []).append(term)
     for (cause, given, otherwise), alike in by_reason.items():

@@ -122,7 +122,7 @@ def _best(line: Line, mirrored: bool) -> Line:
 
 
 @dataclass(frozen=True)
-class Field:
+class TextField:
     """One field of a line. value: "" where the text is ambiguous."""
 
     name: str
@@ -196,7 +196,7 @@ _PATTERNS: tuple[tuple[str, str, Reader], ...] = (
 )
 
 
-def find_fields(lines: Sequence[Line]) -> tuple[Field, ...]:
+def find_fields(lines: Sequence[Line]) -> tuple[TextField, ...]:
     """Find all fields of the lines, in their order, and the frame number if one number lies in the run's range."""
     found = [field for line in lines for field in _fields_of_line(line)]
     return (*found, *_frame_number(lines, found))
@@ -217,17 +217,17 @@ def is_of_film(line: Line) -> bool:
     return _FILM.search(line.text.upper()) is not None
 
 
-def _fields_of_line(line: Line) -> list[Field]:
+def _fields_of_line(line: Line) -> list[TextField]:
     text = line.text.upper()
-    fields: dict[str, Field] = {}
+    fields: dict[str, TextField] = {}
     for name, pattern, value in _PATTERNS:
         match = re.search(pattern, text)
         if match is not None and name not in fields:
-            fields[name] = Field(name, line.text[match.start() : match.end()].strip(), value(match), line)
+            fields[name] = TextField(name, line.text[match.start() : match.end()].strip(), value(match), line)
     return list(fields.values())
 
 
-def _frame_number(lines: Sequence[Line], found: Sequence[Field]) -> list[Field]:
+def _frame_number(lines: Sequence[Line], found: Sequence[TextField]) -> list[TextField]:
     """The frame number: the only number within the range of the run's frames, with as many digits."""
     ranges: Mapping[str, tuple[str, str]] = {
         field.value: (field.value.split("-")[0], field.value.split("-")[1])
@@ -245,4 +245,4 @@ def _frame_number(lines: Sequence[Line], found: Sequence[Field]) -> list[Field]:
         for digits in re.findall(r"\d+", line.text):
             if len(first) <= len(digits) <= len(last) and int(first) <= int(digits) <= int(last):
                 numbers.setdefault(digits, line)
-    return [Field("frame", digits, digits, line) for digits, line in numbers.items()] if len(numbers) == 1 else []
+    return [TextField("frame", digits, digits, line) for digits, line in numbers.items()] if len(numbers) == 1 else []

@@ -26,7 +26,7 @@ from measure.flags import NO_REASON, Code, Reason, Status
 from measure.matching.window import ScanWindow, clipped_sides
 from measure.results import Covariance, MarkMeasurement
 from measure.scans.scan import Scan
-from measure.targets.block_search import Candidate, Patches
+from measure.targets.block_search import Patches, TargetCandidate
 from measure.targets.detection import DiskSearch, disk_candidates
 from measure.targets.disks import FittedDisk, fit_plain_disks
 
@@ -95,7 +95,7 @@ def _measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> BoardMeasurement:
     return _unless_alone(measured, f"grids of {grid_size(spec, 'dots')}", grid.others_px)
 
 
-def _appearances(patches: list[Candidate]) -> Array:
+def _appearances(patches: list[TargetCandidate]) -> Array:
     """(n, 3) logarithms of size and contrast, and sign of the contrast."""
     return np.array(
         [(np.log(patch.radius_px), np.log(abs(patch.contrast_dn)), np.sign(patch.contrast_dn)) for patch in patches]
@@ -109,7 +109,7 @@ def _largest_dot_px(scan: Scan, spec: CircleGridSpec) -> float:
     return max(2 * _SMALLEST_DOT_PX, share * max(scan.width_px, scan.height_px) / places)
 
 
-def _predicted(place: Place, detected: Mapping[Place, Candidate]) -> Candidate:
+def _predicted(place: Place, detected: Mapping[Place, TargetCandidate]) -> TargetCandidate:
     """Predict a dot by a homography of its nearest neighbours, with their mean shape and contrast."""
     others = sorted(detected, key=lambda other: np.hypot(other[0] - place[0], other[1] - place[1]))
     nearest = others[: max(_NEAREST_DOTS, len(others) // 3)]
@@ -119,10 +119,10 @@ def _predicted(place: Place, detected: Mapping[Place, Candidate]) -> Candidate:
     x, y, w = np.asarray(homography, float) @ (*place, 1.0)
     alike = Patches.collect([detected[each] for each in nearest[:_NEAREST_DOTS]])
     shape = np.linalg.cholesky((alike.shapes @ alike.shapes.swapaxes(1, 2)).mean(axis=0))
-    return Candidate(np.array([x / w, y / w]), shape, float(alike.contrasts.mean()))
+    return TargetCandidate(np.array([x / w, y / w]), shape, float(alike.contrasts.mean()))
 
 
-def _is_whole(scan: Scan, disk: Candidate | FittedDisk) -> bool:
+def _is_whole(scan: Scan, disk: TargetCandidate | FittedDisk) -> bool:
     """Whether a dot lies in the scan with all of its edge: lens and drawing put others up to 7 sigmas off."""
     reach_px, size_px = np.linalg.norm(disk.pixel_from_disk, axis=1), np.array([scan.width_px, scan.height_px])
     return bool(np.all(np.abs(2 * disk.center_px + 1 - size_px) + 2 * reach_px <= size_px))

@@ -44,7 +44,7 @@ _LEAST_CACHED = 32 << 20  # bytes
 
 
 @dataclass(frozen=True)
-class Effort:
+class SearchEffort:
     """Effort of a search. cache_bytes: largest size of the cache; half_px: largest half size of the template of a
     cross, px of the reduced scan, since the centre suffices where one arm is far longer."""
 

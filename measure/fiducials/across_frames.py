@@ -101,7 +101,7 @@ Frames = Mapping[int, FrameMisfit]  # by index among the camera's frames
 
 
 @dataclass(frozen=True, eq=False)
-class Pattern:
+class MisfitPattern:
     """Misfit of m sites that is common to all frames.
 
     Attributes
@@ -179,11 +179,11 @@ class Pattern:
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
+class FramesExplanation:
     """Explanation of all frames of a camera, with their common pattern. film_is_more: whether the film scatters
     significantly more than its prior."""
 
-    pattern: Pattern
+    pattern: MisfitPattern
     film: Scatter
     film_is_more: bool
 
@@ -205,7 +205,7 @@ class Explanation:
         return float(alone + self.pattern.log_density + odd * np.log(FALSE_DOUBT))
 
 
-def explain_by_pattern(frames: Frames, sites: Pattern, believed_mm: float) -> Explanation:
+def explain_by_pattern(frames: Frames, sites: MisfitPattern, believed_mm: float) -> FramesExplanation:
     """Explain the frames with a pattern larger than the standard deviations of its sites.
 
     Its prior standard deviation is set to its estimated size, since a wider prior lowers the evidence of the
@@ -216,7 +216,7 @@ def explain_by_pattern(frames: Frames, sites: Pattern, believed_mm: float) -> Ex
     return explain(frames, replace(sites, free_mm=max(size_mm, believed_mm)), believed_mm)
 
 
-def explain(frames: Frames, sites: Pattern, believed_mm: float) -> Explanation:
+def explain(frames: Frames, sites: MisfitPattern, believed_mm: float) -> FramesExplanation:
     """Explain outlying frames, the worst first, each by a gross error in one of its marks or by its film.
 
     Parameters
@@ -252,7 +252,7 @@ def explain(frames: Frames, sites: Pattern, believed_mm: float) -> Explanation:
             for place, each in frames.items():
                 variance = _weak_mm2(each, expected[place], films_mm[place], affinities.get(place, LONE_AFFINITY))
                 frames[place] = replace(each, weak_mm2=variance)
-            return Explanation(replace(sites, frames=frames, films_mm=films_mm), film, is_more)
+            return FramesExplanation(replace(sites, frames=frames, films_mm=films_mm), film, is_more)
         limit = min(FALSE_DOUBT / len(frames), max(least, 1e-300) ** _AS_ODD)
         for place, p_value in p_values.items():
             if p_value < limit or p_value == least:
@@ -429,10 +429,10 @@ def _misfit(
     return FrameMisfit(own, sites, pose, weak, off_mm=np.zeros(len(marks)), suspect_mm2=np.zeros(len(marks)))
 
 
-def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) -> tuple[Explanation, Reason]:
+def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) -> tuple[FramesExplanation, Reason]:
     """Explain the misfits by film and marks alone, wrong given coordinates or the scanner, with the problem."""
     given_mm = np.array([min(max(mark.sigma_mm), MOST_GIVEN_SIGMA_MM) for mark in layout.marks])
-    given = Pattern(np.array([mark.xy_mm for mark in layout.marks]), given_mm)
+    given = MisfitPattern(np.array([mark.xy_mm for mark in layout.marks]), given_mm)
     by_given = explain(frames, given, film_mm)
     if by_given.is_lone:
         return by_given, NO_REASON
@@ -444,7 +444,7 @@ def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) ->
     )
     if len({each.pose for each in frames.values()}) > 1 and (has_outliers or not is_clear):
         sites, turned = _in_scan_axes(frames, given_mm)
-        by_scanner = explain_by_pattern(turned, Pattern(sites, np.zeros(len(sites))), film_mm)
+        by_scanner = explain_by_pattern(turned, MisfitPattern(sites, np.zeros(len(sites))), film_mm)
         lead = by_scanner.log_evidence - by_places.log_evidence
         if lead > NAMED and by_scanner.pattern.p_value < FALSE_DOUBT:
             most = float(np.hypot(*by_scanner.pattern.mm.T).max())
@@ -486,7 +486,7 @@ def _in_scan_axes(frames: Frames, given_mm: Array) -> tuple[Array, dict[int, Fra
 
 
 def _add_findings(
-    frame: FrameMeasurement, place: int, shared: Explanation, names: Sequence[str], film: BelievedFilm
+    frame: FrameMeasurement, place: int, shared: FramesExplanation, names: Sequence[str], film: BelievedFilm
 ) -> tuple[FrameMeasurement, float]:
     """Add the findings to a frame: covariances, statuses and problems. Returns also the film's standard deviation."""
     own = shared.frames[place]
@@ -513,7 +513,7 @@ def _add_findings(
     return replace(_replace_marks(frame, changed), problems=problems), film_mm
 
 
-def _problem(place: int, shared: Explanation, names: Sequence[str], known_um: float) -> Reason:
+def _problem(place: int, shared: FramesExplanation, names: Sequence[str], known_um: float) -> Reason:
     """Problem of an outlying frame, empty for any other. known_um: standard deviation that its marks are given."""
     own = shared.frames[place]
     if own.film_mm is None:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import comb
 
 from measure.detection.localisation import localise
-from measure.detection.responses import Effort
+from measure.detection.responses import SearchEffort
 from measure.fiducials.constellation import Placement, distinct_places
 from measure.fiducials.measure_frame import Frame, detect_frame
 from measure.fiducials.options import FiducialOptions
@@ -23,7 +23,7 @@ from measure.matching.models import MatchOptions
 from measure.scans.scan import Scan
 
 _COMPARED = 3  # best places: the one with the fewest false alarms is among them
-_QUICK = Effort(cache_bytes=48 << 20, half_px=16)
+_QUICK = SearchEffort(cache_bytes=48 << 20, half_px=16)
 _AT_LEAST = 3  # marks of a frame that must be detected
 _PLACES = 2  # best places that are tried
 _QUICK_OPTIONS = FiducialOptions(match=MatchOptions(damage_rounds=1))  # likeness needs less accuracy than the place

@@ -320,7 +320,7 @@ class PosedMark(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class MarkImage:
     """Image of a mark on the drawings' grid, with its origin in the middle.
 
     Attributes
@@ -337,7 +337,7 @@ class View:
     covered: Mask
     noise: float = 0.0
 
-    def change(self, change: Callable[[Any], Any]) -> "View":
+    def change(self, change: Callable[[Any], Any]) -> "MarkImage":
         """Apply the same change, for example a rotation, to the image and both masks."""
         return replace(self, grey=change(self.grey), known=change(self.known), covered=change(self.covered))
 
@@ -352,7 +352,7 @@ class View:
         columns = np.stack([np.ones(int(used.sum())), self.grey[used], *slopes])
         return tukey_fit(columns, window[used], _ROUNDS, _LEAST_SCALE)
 
-    def align(self, window: Array) -> "View":
+    def align(self, window: Array) -> "MarkImage":
         """Shift by a fraction of a cell to match a window (size, size), on which it already lies to within a cell."""
         used, moved, shift = self.known & self.covered, self, np.zeros(2)
         for _ in range(_ALIGNMENTS):
@@ -363,7 +363,7 @@ class View:
             moved = replace(self, grey=np.asarray(ndimage.shift(self.grey, shift, order=3, mode="nearest")))
         return moved
 
-    def unlike(self, other: "View", contrast: float) -> float:
+    def unlike(self, other: "MarkImage", contrast: float) -> float:
         """Sum of squared differences of two chips beyond their noise, where both are known, after alignment. contrast:
         of the image in the scan, in standard deviations of its noise; differences are clipped as its outliers are."""
         used = self.known & other.known & self.covered & other.covered
@@ -377,7 +377,7 @@ class View:
 
 
 _EVERYWHERE = np.ones((1, 1), dtype=bool)
-_BARE = View(np.zeros((1, 1)), _EVERYWHERE, _EVERYWHERE)
+_BARE = MarkImage(np.zeros((1, 1)), _EVERYWHERE, _EVERYWHERE)
 
 
 def _turn_and_pad(picture: Any, turn: Array, spare: int) -> Any:
@@ -402,7 +402,7 @@ class Drawings:
         self.scan_from_grid = scan_from_up @ np.linalg.inv(grid_from_up)
         self._views = {mark: _draw_view(mark, grid_from_up, blur_px / self.reduction) for mark in set(marks)}
 
-    def views(self, shown: Sequence[PosedMark], spare: int) -> list[View]:
+    def views(self, shown: Sequence[PosedMark], spare: int) -> list[MarkImage]:
         """Image that each orientation predicts at a place, centred on grids of one size: spare cells larger on every
         side than the largest image."""
         drawn = [_BARE if each.mark is None else self._views[each.mark] for each in shown]
@@ -462,14 +462,14 @@ class MarkSite:
         relative = np.exp(-excess / 2 / _PIXELS_PER_DEGREE)
         return np.asarray(np.log((1 - SPOILT) * relative + SPOILT))[view_of]
 
-    def _most_excess(self, best: View, view: View, scale_dn: float) -> float:
+    def _most_excess(self, best: MarkImage, view: MarkImage, scale_dn: float) -> float:
         """Largest excess misfit of a chip over the best one that their difference explains, noise included."""
         if view is best or not view.is_chip:
             return 0.0 if view is best else np.inf
         squares = view.unlike(best, abs(self.like.contrast_dn) / scale_dn)
         return squares + 2 * _CHANCE_SIGMAS * float(np.sqrt(squares))
 
-    def _placed(self, window: Array, view: View, spare: int) -> View:
+    def _placed(self, window: Array, view: MarkImage, spare: int) -> MarkImage:
         """Shift a chip to the maximum of its correlation (NCC) with the window."""
         if not view.is_chip or not view.known.any():
             return view
@@ -510,7 +510,7 @@ class MarkSite:
         return tukey_fit(np.stack(ground), grey, _ROUNDS, _LEAST_SCALE).residuals
 
 
-def _draw_view(mark: Mark, grid_from_mark: Array, blur_px: float) -> View:
+def _draw_view(mark: Mark, grid_from_mark: Array, blur_px: float) -> MarkImage:
     """Draw a mark centred on its origin."""
     place = np.column_stack([grid_from_mark, np.zeros(2)])
     half = int(np.ceil(np.abs(extent_px(mark, place)).max() + 2 * _ABOUT_PX))
@@ -523,12 +523,12 @@ def _draw_view(mark: Mark, grid_from_mark: Array, blur_px: float) -> View:
         # As a fraction of the contrast; of a mean of several scans, each with its share.
         of_mean = float(np.sqrt(sum(share**2 for share in mark.shares.values())))
         noise = mark.noise_dn * of_mean / max(float(np.ptp(mark.image)), 1e-9) if mark.noise_dn else np.inf
-    return View(picture(mark, place, size, size, blur_px, ROUGH_CELLS), known, covered, noise)
+    return MarkImage(picture(mark, place, size, size, blur_px, ROUGH_CELLS), known, covered, noise)
 
 
-def _distinct(views: Sequence[View]) -> tuple[list[View], list[int]]:
+def _distinct(views: Sequence[MarkImage]) -> tuple[list[MarkImage], list[int]]:
     """Views with different images, and the index of each view among these."""
-    kinds: list[View] = []
+    kinds: list[MarkImage] = []
     index = []
     for each in views:
         alike = [number for number, kind in enumerate(kinds) if np.abs(kind.grey - each.grey).max() < _ALIKE]

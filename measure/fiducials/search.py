@@ -8,7 +8,7 @@ from operator import attrgetter
 import numpy as np
 
 from measure.detection.correlation import WIDE, Surroundings
-from measure.detection.responses import Effort, MarkView, Responses, correlate_scan, correlate_windows
+from measure.detection.responses import MarkView, Responses, SearchEffort, correlate_scan, correlate_windows
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, lattice_steps_mm, mark_sign
 from measure.fiducials.options import FiducialOptions
 from measure.geometry import POSES, UP_FROM_CAMERA
@@ -138,9 +138,9 @@ class FrameSearch:
     with the same drawn_mm."""
 
     def __init__(
-        self, scan: Scan, layout: FiducialLayout, options: FiducialOptions, effort: Effort | None = None
+        self, scan: Scan, layout: FiducialLayout, options: FiducialOptions, effort: SearchEffort | None = None
     ) -> None:
-        self.scan, self.layout, self._effort = scan, layout, effort or Effort()
+        self.scan, self.layout, self._effort = scan, layout, effort or SearchEffort()
         self._poses = POSES if options.pose == "auto" else (options.pose,)
         self._camera_mm = np.array([mark.xy_mm for mark in layout.marks])
         self._signs = {mark_sign(mark.mark, assumed) for mark in layout.marks for assumed in (1, -1)}

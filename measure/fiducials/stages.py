@@ -103,7 +103,7 @@ class Stage:
         """Whether its result replaces an earlier one, taken or not."""
         return self.kind in ("middle", "given")
 
-    def is_unnecessary(self, found: "Found") -> bool:
+    def is_unnecessary(self, found: "StageResult") -> bool:
         """Whether the earlier results make it unnecessary."""
         frame = found.frame if found.is_taken else None
         if self.tone is not None:
@@ -122,7 +122,7 @@ class Stage:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class StageResult:
     """Result of the stages so far.
 
     Attributes
@@ -173,11 +173,11 @@ def list_stages(
 
 def find_frame(
     scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
-) -> Found:
+) -> StageResult:
     """Find the frame of a scan. pitch_um: given by the user or the file, None if unknown."""
     stages = list_stages(scan, layout, pitch_um, options)
     search, result = FrameSearch(scan, layout, options), SearchResult()
-    found, hypotheses_so_far, hypotheses_at_given_pitch = Found(), 0, 0
+    found, hypotheses_so_far, hypotheses_at_given_pitch = StageResult(), 0, 0
     for stage in stages:
         if stage.is_unnecessary(found):
             continue
@@ -313,7 +313,7 @@ def explain_misfit(frame: Frame) -> Reason:
     return Reason(f"the constellation does not fit: only {found}", Code.NO_FRAME)
 
 
-def _what_to_do(found: Found) -> str:
+def _what_to_do(found: StageResult) -> str:
     """Clause on the best of the possible false alarms, with the pitch to try, or on a rejected frame with less than one
     expected false alarm; empty without either."""
     if found.unsure:

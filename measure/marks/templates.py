@@ -165,7 +165,7 @@ def _designs(image: Array, variances_px2: Array, steady: Mask) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class _TemplateFit:
     """Fit of one image to the shared one, in its grey values. levelled, residuals, alike (side, side): image, residuals
     and Tukey's weights; scale: standard deviation of the residuals; blur_px2: correction of the blur's variance."""
 
@@ -177,7 +177,7 @@ class _Fit:
     blur_sigma_px2: float
 
 
-def _fit(picture: Array, design: Array, weights: Array) -> _Fit:
+def _fit(picture: Array, design: Array, weights: Array) -> _TemplateFit:
     """Fit an image to the shared one, robustly against dust and background. Residuals as large as the changes by shift
     and blur are not yet treated as damage; the next round decides."""
     columns, grey = design.reshape(len(design), -1), picture.ravel()
@@ -193,7 +193,7 @@ def _fit(picture: Array, design: Array, weights: Array) -> _Fit:
         changes = factors[_COL:] @ columns[_COL:] / gain
         alike = tukey_weights(residuals / np.hypot(scale, changes), 1.0)
         weights = (alike + _LEAST_WEIGHT) / scale**2
-    return _Fit(
+    return _TemplateFit(
         (picture - factors[_OFFSET]) / gain,
         residuals.reshape(picture.shape),
         alike.reshape(picture.shape),

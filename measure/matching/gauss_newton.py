@@ -10,7 +10,7 @@ from measure.array_types import Array, Mask
 from measure.flags import NO_REASON, Code, Reason
 from measure.marks.rendering import chip_mask, picture, true_mask
 from measure.marks.shapes import MarkTemplate
-from measure.matching.models import BENT, GREY, ROUGHLY_BENT, ROUNDING_DN, PictureModel, State
+from measure.matching.models import BENT, GREY, ROUGHLY_BENT, ROUNDING_DN, FitState, PictureModel
 from measure.matching.window import ScanWindow, noise_scale
 from measure.noise.noise_model import NoiseModel, combined, correlated, may_be_noise, products, steadiness, weighted
 from measure.noise.robust_estimation import damage, grown, robust_scale, solution, tukey_loss, tukey_weights
@@ -37,7 +37,7 @@ _GROUND = 0.1  # fraction of the mark's contrast: pixels that show less are back
 _OWN = 0.3  # fraction of the mark's contrast: pixels that show more are the mark
 
 
-class Model(Protocol):
+class FitModel(Protocol):
     """Model fitted to an image. It owns residuals, derivatives, weights and priors."""
 
     def solve(self) -> Array | None:
@@ -51,7 +51,7 @@ class Model(Protocol):
 
 
 @runtime_checkable
-class ReversibleModel(Model, Protocol):
+class ReversibleModel(FitModel, Protocol):
     """Model whose steps can be halved. state: replaced by each step."""
 
     state: Any
@@ -67,7 +67,7 @@ class Outcome(NamedTuple):
     moved_px: float
 
 
-def gauss_newton(model: Model, tolerance_px: float, iterations: int, halvings: int = 0) -> Outcome:
+def gauss_newton(model: FitModel, tolerance_px: float, iterations: int, halvings: int = 0) -> Outcome:
     """Iterate a model until a step is shorter than a tolerance.
 
     Parameters
@@ -138,11 +138,11 @@ class PictureFit:
         self.reason = NO_REASON
 
     @property
-    def state(self) -> State:
+    def state(self) -> FitState:
         return self.model.state
 
     @state.setter
-    def state(self, state: State) -> None:
+    def state(self, state: FitState) -> None:
         self.model.state = state
 
     def approach(self) -> None:

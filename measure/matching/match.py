@@ -27,7 +27,7 @@ from measure.matching.covariance import (
     sloping_place,
 )
 from measure.matching.gauss_newton import EDGE_BLURS, PictureFit
-from measure.matching.models import GREY, MatchOptions, PictureModel, State, background_px, smoothed_px2
+from measure.matching.models import GREY, FitState, MatchOptions, PictureModel, background_px, smoothed_px2
 from measure.matching.tone_information import mark_tone_information, sharpening_score
 from measure.matching.window import ScanWindow
 from measure.noise.grain import blank_patches, grain_model, is_coloured
@@ -70,7 +70,7 @@ def match(
     window = replace(window, grey=np.where(usable, np.asarray(window.grey, float), 0.0), valid=usable)
     begun = None
     if before is not None and before.covariance is not None:
-        begun = State(before.pixel_from_mark, before.blur_px**2 + smoothed_px2(mark), np.zeros(GREY))
+        begun = FitState(before.pixel_from_mark, before.blur_px**2 + smoothed_px2(mark), np.zeros(GREY))
     fit = _fit(window, mark, start, options, begun=begun)
     if begun is not None and fit.reason:
         fit = _fit(window, mark, start, options)
@@ -90,7 +90,7 @@ def _fit(
     start: Array,
     options: MatchOptions,
     coarse_px: float | None = None,
-    begun: State | None = None,
+    begun: FitState | None = None,
 ) -> PictureFit:
     """Fit the mark in the part of the window around it. coarse_px: blur (px) whose result is subtracted as background;
     None: the background is modelled. begun: state in the scan, nearly the result."""

@@ -106,7 +106,7 @@ def background_px(mark: Mark, pixel_from_mark: Array) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class FitState:
     """State of the model. pixel_from_mark (2, 3); variance_px2: of the blur; greys (4,): gain, offset and slopes, 0
     until fitted."""
 
@@ -114,11 +114,11 @@ class State:
     variance_px2: float
     greys: Array
 
-    def shifted(self, shift_px: Array) -> "State":
+    def shifted(self, shift_px: Array) -> "FitState":
         """Translate the state by shift_px (2,); the greys are reset and must be fitted again."""
         place = self.pixel_from_mark.copy()
         place[:, 2] += shift_px
-        return State(place, self.variance_px2, np.zeros(GREY))
+        return FitState(place, self.variance_px2, np.zeros(GREY))
 
 
 class PictureModel:
@@ -179,11 +179,11 @@ class PictureModel:
             self.prior_weights[self.blur] = 1 / (2 * total_px2 * options.blur_sigma) ** 2
         # A chip contains the blur of its scan already: add none unless it is estimated.
         added_px2 = 0.0 if self.is_chip and not options.estimate_blur else options.blur_px**2
-        self.state = State(start.copy(), added_px2 + self.smoothed_px2, np.zeros(GREY))
+        self.state = FitState(start.copy(), added_px2 + self.smoothed_px2, np.zeros(GREY))
         self.bent = BENT
         self._drawn, self._mark_from_drawn = start[:, :2].copy(), np.linalg.inv(start[:, :2])
         self._mark_from_start = np.linalg.inv(start[:, :2])
-        self._linearised: tuple[State, Array] | None = None  # state of the design matrix, and its residuals
+        self._linearised: tuple[FitState, Array] | None = None  # state of the design matrix, and its residuals
         self.reach_px = reach_px(mark, start[:, :2])
         self.ground = background_planes(*grey.shape)
         self.design = np.zeros((moving + GREY, *grey.shape))
@@ -202,7 +202,7 @@ class PictureModel:
         greys, columns = self.design[-GREY:], self.design[:-GREY]
         greys[0], greys[1:] = self.detail(shown.value), self.ground
         if not self.state.greys.any():
-            self.state = State(place, self.state.variance_px2, factors(greys * used, self.grey))
+            self.state = FitState(place, self.state.variance_px2, factors(greys * used, self.grey))
         # In single precision, like the rendering.
         col, row = np.arange(width) - place[0, 2], (np.arange(height) - place[1, 2])[:, None]
         slopes = shown.by_col, shown.by_row
@@ -261,7 +261,7 @@ class PictureModel:
             total_px = self.total_blur_px
             ratio = np.clip(1 + step[self.blur] / longest / (2 * total_px**2), 1 / _MOST_BLURRED, _MOST_BLURRED)
             variance = float(np.clip((total_px * ratio) ** 2 - PIXEL_VARIANCE_PX2, *self._variance_range))
-        self.state = State(place, variance, self.state.greys + step[-GREY:] / longest)
+        self.state = FitState(place, variance, self.state.greys + step[-GREY:] / longest)
         return float(np.hypot(*shift) + max(self.grey.shape) / 4 * _LONGEST_CHANGE * largest)
 
     @property
@@ -291,7 +291,7 @@ class PictureModel:
         low, high = _BLUR_RANGE_PX
         return (0.0 if self.is_chip else low**2), high**2
 
-    def has_moved(self, before: State, by_px: float) -> bool:
+    def has_moved(self, before: FitState, by_px: float) -> bool:
         """Whether the mark's outline has moved by more than by_px since an earlier state. A change of the blur counts
         twice, because the standard deviations depend on it."""
         change = self._change(before)
@@ -299,7 +299,7 @@ class PictureModel:
         blurred = abs(float(np.sqrt(self.state.variance_px2) - np.sqrt(before.variance_px2)))
         return length + 2 * blurred > by_px
 
-    def _change(self, before: State) -> Array:
+    def _change(self, before: FitState) -> Array:
         """(unknowns,) change of the parameters from an earlier, nearby state to the current one."""
         change = np.zeros(len(self.design))
         place, linear = self.state.pixel_from_mark, before.pixel_from_mark[:, :2]

@@ -30,7 +30,7 @@ ROW_BYTES, BLOCK_BYTES = 1 << 14, 1 << 24  # largest block, without its margin; 
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class ScanBlock:
     """Part of a scan. place_px: column and row of its first pixel; samples (height, width, channels), with a border of
     margin_px that belongs to the neighbours or repeats the scan's edge."""
 
@@ -98,7 +98,7 @@ def concatenate(first: Record, *others: Record) -> Record:
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class TargetCandidate:
     """Candidate for a target: center_px (2,), pixel_from_disk (2, 2), contrast_dn: positive if light."""
 
     center_px: Array
@@ -121,15 +121,15 @@ class Patches:
     contrasts: Array
 
     @classmethod
-    def collect(cls, candidates: Sequence[Candidate]) -> "Patches":
+    def collect(cls, candidates: Sequence[TargetCandidate]) -> "Patches":
         return cls(
             np.array([each.center_px for each in candidates]).reshape(-1, 2),
             np.array([each.pixel_from_disk for each in candidates]).reshape(-1, 2, 2),
             np.array([each.contrast_dn for each in candidates], float),
         )
 
-    def candidates(self) -> list[Candidate]:
-        return [*map(Candidate, self.centers, self.shapes, self.contrasts.tolist())]
+    def candidates(self) -> list[TargetCandidate]:
+        return [*map(TargetCandidate, self.centers, self.shapes, self.contrasts.tolist())]
 
     def part(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "Patches":
         return Patches(self.centers[chosen], self.shapes[chosen], self.contrasts[chosen])
@@ -155,8 +155,8 @@ class Octave:
 
 
 def search_blocks(
-    scan: Scan, octaves: Sequence[Octave], test_patches: Callable[[Block, Patches], Patches] | None = None
-) -> list[Candidate]:
+    scan: Scan, octaves: Sequence[Octave], test_patches: Callable[[ScanBlock, Patches], Patches] | None = None
+) -> list[TargetCandidate]:
     """Search all octaves of a scan in one pass over its blocks.
 
     Parameters
@@ -176,7 +176,7 @@ def search_blocks(
     def block_patches(corner: tuple[int, int]) -> Patches:
         row0, col0 = (place - margin for place in corner)
         memory = spare.pop() if spare else np.empty((rows, cols, scan.channels), scan.samples_dtype)
-        block = Block(scan, (col0, row0), margin, scan.samples(col0, row0, cols, rows, memory))
+        block = ScanBlock(scan, (col0, row0), margin, scan.samples(col0, row0, cols, rows, memory))
         found = _drop_overlapping(concatenate(Patches.collect(()), *_octave_patches(block, octaves)))
         found = test_patches(block, found) if test_patches else found
         spare.append(memory)
@@ -208,7 +208,7 @@ def _round_up(size: int, unit: int) -> int:
     return -(-size // unit) * unit
 
 
-def _octave_patches(block: Block, octaves: Sequence[Octave]) -> Iterator[Patches]:
+def _octave_patches(block: ScanBlock, octaves: Sequence[Octave]) -> Iterator[Patches]:
     """Patches within the block, in pixels of the scan."""
     reductions = block.reductions({octave.factor for octave in octaves})
     width, height = (size - 2 * block.margin_px for size in block.size_px)

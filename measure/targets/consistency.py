@@ -57,7 +57,7 @@ class TargetPlaces:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class TargetComparison:
     """Each of n targets against the prediction from the others.
 
     Attributes
@@ -76,7 +76,7 @@ class Comparison:
 
 def compare_targets(
     targets: TargetPlaces, observed_px: Array, covariance_px2: Array, size_px: tuple[int, int]
-) -> Comparison:
+) -> TargetComparison:
     """Test each target of an image against the others.
 
     Parameters
@@ -92,7 +92,7 @@ def compare_targets(
     fits = [_regression(_design(targets, size_px, bending), offsets, targets, covariance_px2) for bending in _BENDING]
     best = min(fits, key=lambda fit: float(np.median(np.linalg.norm(fit.off_px, axis=1))))
     own = covariance_px2 + best.more_px2[:, None, None] * np.eye(2)
-    return Comparison(best.off_px, _p_values(best, targets), own + best.predicted_px2, best.off_px)
+    return TargetComparison(best.off_px, _p_values(best, targets), own + best.predicted_px2, best.off_px)
 
 
 def _design(targets: TargetPlaces, size_px: tuple[int, int], bending: float) -> Array:
@@ -113,7 +113,7 @@ def _design(targets: TargetPlaces, size_px: tuple[int, int], bending: float) -> 
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class _Regression:
     """Cross-validated regression of n targets. off_px (n, 2): observed minus predicted; squares (n,): squared
     Mahalanobis distances; unknowns: effective number; predicted_px2 (n, 2, 2): covariance of the prediction; more_px2
     (n,): unexplained variance per coordinate."""
@@ -125,7 +125,7 @@ class _Fit:
     more_px2: Array
 
 
-def _regression(design: Array, offsets: Array, targets: TargetPlaces, observed_px2: Array) -> _Fit:
+def _regression(design: Array, offsets: Array, targets: TargetPlaces, observed_px2: Array) -> _Regression:
     """Regression with Student's t errors by expectation-maximisation; the scatter is re-estimated in each round."""
     off, predicted, unknowns = offsets - np.median(offsets, axis=0), np.zeros_like(observed_px2), design.shape[2]
     variances, more_px2 = _scatter(off, predicted, targets, observed_px2)
@@ -143,7 +143,7 @@ def _regression(design: Array, offsets: Array, targets: TargetPlaces, observed_p
         predicted = hat + hat @ without @ hat
         squares = _squares(off, variances + predicted)
         before, weights = weights, student_weights(squares, 2.0)
-        fit = _Fit(off, squares, float(np.einsum("nij,nji->", hat, by_weight)), predicted, more_px2)
+        fit = _Regression(off, squares, float(np.einsum("nij,nji->", hat, by_weight)), predicted, more_px2)
         variances, more_px2 = _scatter(off, predicted, targets, observed_px2)
         if np.abs(weights - before).max() < _SETTLED:
             break
@@ -179,7 +179,7 @@ def _scatter(off: Array, predicted: Array, targets: TargetPlaces, observed_px2: 
     return variances, more_px2
 
 
-def _p_values(fit: _Fit, targets: TargetPlaces) -> Array:
+def _p_values(fit: _Regression, targets: TargetPlaces) -> Array:
     """(n,) p-values of the deviations: F-distributed, since the scatter is estimated; scaled by the local scatter."""
     count = min(_NEIGHBOURS + 1, len(fit.squares))
     near = np.asarray(cKDTree(targets.places_px).query(targets.places_px, k=np.arange(2, count + 1))[1])
@@ -213,7 +213,7 @@ class ImagePoints:
     covariance_px2: Array
     size_px: tuple[int, int]
 
-    def compare(self, off: Array, covariance: Array) -> Comparison:
+    def compare(self, off: Array, covariance: Array) -> TargetComparison:
         """Test the image with corrections off (n, 3) to its points, of covariance (n, 3, 3)."""
         moved = np.einsum("nij,nj->ni", self.by_point, off)
         known = self.by_point @ covariance @ self.by_point.swapaxes(1, 2)
@@ -224,7 +224,7 @@ class ImagePoints:
         return replace(compared, printed_off_px=compared.off_px + along_sheet)
 
 
-def compare_images(images: Sequence[ImagePoints], xyz: Array) -> list[Comparison]:
+def compare_images(images: Sequence[ImagePoints], xyz: Array) -> list[TargetComparison]:
     """Test the targets of each image against its other targets and against the other images.
 
     Parameters
@@ -274,7 +274,7 @@ class _Readings:
     squares: Array
 
     @classmethod
-    def read(cls, images: Sequence[ImagePoints], comparisons: Sequence[Comparison], offs: Array) -> "_Readings":
+    def read(cls, images: Sequence[ImagePoints], comparisons: Sequence[TargetComparison], offs: Array) -> "_Readings":
         """Form the normal equations of each image about corrections (i, m, 3) from the others.
 
         An image's covariances are enlarged to the median of all images: the points may have been fitted to it, and it

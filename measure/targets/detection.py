@@ -19,7 +19,7 @@ from measure.array_types import Array, Mask, Single
 from measure.marks.shapes import Polarity
 from measure.noise.robust_estimation import robust_scale
 from measure.scans.scan import Scan
-from measure.targets.block_search import Block, Candidate, Octave, Patches, concatenate, search_blocks
+from measure.targets.block_search import Octave, Patches, ScanBlock, TargetCandidate, concatenate, search_blocks
 from measure.targets.disk_fit_batch import fit_disks
 
 Sampler = Callable[[NDArray[np.intp], Array], Single]
@@ -252,7 +252,7 @@ def _white_noise(small: Single) -> float:
     return robust_scale(np.asarray((left - 2 * column + right) / 6, float))
 
 
-def disk_candidates(scan: Scan, search: DiskSearch) -> list[Candidate]:
+def disk_candidates(scan: Scan, search: DiskSearch) -> list[TargetCandidate]:
     """Detect disks in a whole scan, in one pass over its blocks.
 
     Returns
@@ -270,7 +270,7 @@ def disk_candidates(scan: Scan, search: DiskSearch) -> list[Candidate]:
         for factor, radii in by_factor.items()
     ]
 
-    def disks(block: Block, patches: Patches) -> Patches:
+    def disks(block: ScanBlock, patches: Patches) -> Patches:
         """Fitted disks whose axes agree with the stated diameters in an oblique view."""
         found = fit_disks(block, patches)
         longer, shorter = 2 * np.linalg.svd(found.shapes, compute_uv=False).T
@@ -296,7 +296,7 @@ class CrossSearch:
             raise ValueError(f"line is {self.line} of half a cross; a share between 0 and 1 is right")
 
 
-def cross_candidates(scan: Scan, search: CrossSearch) -> list[Candidate]:
+def cross_candidates(scan: Scan, search: CrossSearch) -> list[TargetCandidate]:
     """Detect crosses in a whole scan, in one pass over its blocks.
 
     Returns
@@ -340,7 +340,7 @@ def _cross_patches(
 
 def _crosses(
     thin: Single, level: float, half: tuple[float, float], search: CrossSearch, sign: float
-) -> list[Candidate]:
+) -> list[TargetCandidate]:
     _, labels, stats, _ = cv2.connectedComponentsWithStats((thin > level).astype(np.uint8))
     found = []
     for label, (left, top, wide, tall, area) in enumerate(stats[1:], 1):
@@ -357,7 +357,7 @@ def _crosses(
         length = np.hypot(*bars)
         if half[0] / 1.5 < length.max() < 1.5 * half[1]:
             contrast = sign * float(np.median(patch[patch > 0.0]))
-            found.append(Candidate(center + np.array([left, top]), bars, contrast))
+            found.append(TargetCandidate(center + np.array([left, top]), bars, contrast))
     return found
 
 

@@ -16,7 +16,7 @@ from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.noise.noise_model import influence_covariances
 from measure.noise.robust_estimation import SIGMA_OF_DEVIATION, gauss_newton_step, tukey_weights
 from measure.results import Covariance, MarkFit
-from measure.targets.block_search import Block, Patches, concatenate
+from measure.targets.block_search import Patches, ScanBlock, concatenate
 
 _GROUP_PIXELS = 1 << 16  # pixels of the windows that are fitted together: 10 MiB with their derivatives
 _FIRST_BLUR_PX, _BLUR_PX = 1.0, (0.5, 8.0)  # initial value and limits, standard deviations, pixel width included
@@ -37,7 +37,7 @@ _EDGE_SAMPLES = 16  # sampled pixels on the edge, four pixels wide, that suffice
 _FARTHEST, _MOST_GROWN = 0.5, float(np.log(1.5))  # change of centre in radii, of log size; beyond: another object
 
 
-def fit_disks(block: Block, patches: Patches) -> Patches:
+def fit_disks(block: ScanBlock, patches: Patches) -> Patches:
     """Patches that are disks, fitted, the strongest first; centres are right to a tenth of a pixel or so."""
     radius = patches.radii
     first = np.full(len(radius), _FIRST_BLUR_PX)
@@ -49,7 +49,7 @@ def fit_disks(block: Block, patches: Patches) -> Patches:
 
 
 def _fit_patches(
-    block: Block,
+    block: ScanBlock,
     patches: Patches,
     blurs: Array,
     strides: Indices,
@@ -61,13 +61,13 @@ def _fit_patches(
     found, blurs_found = [Patches.collect(())], [np.zeros(0)]
     margins_px = np.maximum(MARGIN * patches.radii, LEAST_MARGIN_PX)
     for group in _groups(patches, strides, margins_px):
-        own, fit = group, _Fit(block, patches.part(group), blurs[group], strides[group], margins_px[group])
+        own, fit = group, _DiskFit(block, patches.part(group), blurs[group], strides[group], margins_px[group])
         is_promising = fit.misfit() < most_misfits[0]
         if not is_promising.all():  # the outline alone rules most patches out
             own = group[is_promising]
             if not len(own):
                 continue
-            fit = _Fit(block, patches.part(own), blurs[own], strides[own], margins_px[own])
+            fit = _DiskFit(block, patches.part(own), blurs[own], strides[own], margins_px[own])
         for is_robust in steps_robust:
             fit.step(is_robust)
         is_disk = fit.is_disk(patches.part(own), most_misfits[1])
@@ -76,13 +76,13 @@ def _fit_patches(
     return concatenate(*found), np.concatenate(blurs_found)
 
 
-def place_disks(block: Block, patches: Patches, margins_px: Array) -> list[MarkFit]:
+def place_disks(block: ScanBlock, patches: Patches, margins_px: Array) -> list[MarkFit]:
     """Fit many disks at once to convergence, each with margins_px (n,) of background."""
     strides, blurs = np.ones(len(patches.radii), np.intp), np.full(len(patches.radii), _FIRST_BLUR_PX)
     placed: dict[int, MarkFit] = {}
     for group in _groups(patches, strides, margins_px):
         own = patches.part(group)
-        fit = _Fit(block, own, blurs[group], strides[group], margins_px[group], is_censored=True)
+        fit = _DiskFit(block, own, blurs[group], strides[group], margins_px[group], is_censored=True)
         for step in range(_MOST_STEPS):
             before = fit.centers
             fit.step(is_robust=step >= _PLAIN_STEPS)
@@ -110,7 +110,7 @@ def _half_sides(patches: Patches, strides: Indices, margins_px: Array) -> Indice
     return np.asarray(np.ceil((longest + margins_px + 0.5) / strides), np.intp)
 
 
-class _Fit:
+class _DiskFit:
     """State of the fit of n disks. centers (n, 2) relative to the window centres, px; shapes (n, 2, 2); blur (n,), px;
     greys (n, 4): gain, offset, slopes. Windows of side * side pixels: col, row (n, pixels) relative to their centres,
     grey (n, pixels), used (n, pixels): inside the ellipse and its margin. is_censored: whether grey values at the ends
@@ -118,7 +118,7 @@ class _Fit:
 
     def __init__(
         self,
-        block: Block,
+        block: ScanBlock,
         patches: Patches,
         blurs: Array,
         strides: Indices,
@@ -229,7 +229,7 @@ class _Edges:
     """Position of pixels (n, pixels) relative to their ellipse. radius: normalised, 1 on the ellipse; col, row:
     direction in the unit disk; px: length of a radius across the edge; distance: to the edge, px, positive inside."""
 
-    def __init__(self, fit: _Fit) -> None:
+    def __init__(self, fit: _DiskFit) -> None:
         inverse = np.linalg.inv(fit.shapes).astype(np.float32)
         center = fit.centers.astype(np.float32)
         unit = inverse @ np.stack([fit.col - center[:, :1], fit.row - center[:, 1:]], axis=1)
@@ -240,7 +240,7 @@ class _Edges:
         self.px: Single = 1 / np.maximum(np.sqrt(across[:, 0] ** 2 + across[:, 1] ** 2), np.float32(1e-6))
         self.distance = (1 - self.radius) * self.px
 
-    def design(self, fit: _Fit) -> Single:
+    def design(self, fit: _DiskFit) -> Single:
         """(n, unknowns, pixels) derivatives with respect to centre, size, stretch and shear (in units of the ellipse)
         and blur (px), all divided by the gain; then with respect to gain, offset and slopes."""
         blur, size = (one[:, None].astype(np.float32) for one in (fit.blur, fit.radius))

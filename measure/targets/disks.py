@@ -20,7 +20,7 @@ from measure.noise.robust_estimation import MEDIAN_EFFICIENCY, SIGMA_OF_DEVIATIO
 from measure.results import MarkFit
 from measure.scans.jpeg import covariance_of_compression
 from measure.scans.scan import Scan
-from measure.targets.block_search import Block, Candidate, Patches
+from measure.targets.block_search import Patches, ScanBlock, TargetCandidate
 from measure.targets.detection import LEAST_SNR
 from measure.targets.disk_fit_batch import (
     LEAST_MARGIN_PX,
@@ -183,7 +183,7 @@ def fit_disk(
 
 
 def fit_plain_disks(
-    scan: Scan, candidates: Sequence[Candidate], longest_margins_px: Sequence[float]
+    scan: Scan, candidates: Sequence[TargetCandidate], longest_margins_px: Sequence[float]
 ) -> list[FittedDisk]:
     """Fit disks all at once, ten times as fast as `fit_disk`; doubtful ones are fitted again by that.
 
@@ -194,7 +194,7 @@ def fit_plain_disks(
     reach_px = int(np.ceil(np.linalg.norm(patches.shapes, 2, axis=(1, 2)).max(initial=0) + PLAIN_MARGIN_PX)) + 1
     col0, row0 = np.floor(patches.centers.min(axis=0)).astype(int) - reach_px
     width, height = np.ceil(patches.centers.max(axis=0)).astype(int) + reach_px - (col0, row0)
-    block = Block(scan, (int(col0), int(row0)), 0, scan.samples(int(col0), int(row0), int(width), int(height)))
+    block = ScanBlock(scan, (int(col0), int(row0)), 0, scan.samples(int(col0), int(row0), int(width), int(height)))
     placed, disks = place_disks(block, patches, margins_px), []
     for fit, start, margin_px in zip(placed, candidates, longest_margins_px, strict=True):
         disk = _assess(fit, covariance_of_compression(scan.rounding_step_dn, fit.contrast_dn))

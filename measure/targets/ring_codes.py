@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from measure.array_types import Array
 from measure.scans.scan import Scan
-from measure.targets.block_search import Candidate
+from measure.targets.block_search import TargetCandidate
 
 _SAMPLES = 16  # along each segment
 _RING_SHARES = (0.35, 0.5, 0.65)  # sampled positions across the ring, away from its blurred edges
@@ -62,7 +62,7 @@ class RingCode:
         return self.number(np.array([number >> bit & 1 for bit in range(self.bits)[::-1]], bool))
 
 
-def read_code(scan: Scan, dot: Candidate, code: RingCode) -> int | None:
+def read_code(scan: Scan, dot: TargetCandidate, code: RingCode) -> int | None:
     """Read the code in the ring around a dot.
 
     Returns
@@ -85,7 +85,7 @@ def read_code(scan: Scan, dot: Candidate, code: RingCode) -> int | None:
     return _decode(((np.mean(ring, axis=0) - ground) / contrast), code)
 
 
-def _sample_rings(scan: Scan, dot: Candidate, radii: Array, angles: Array) -> Array:
+def _sample_rings(scan: Scan, dot: TargetCandidate, radii: Array, angles: Array) -> Array:
     """(radii, angles) grey values on ellipses similar to the dot's, clockwise in the image."""
     axes = dot.pixel_from_disk
     if np.linalg.det(axes) < 0.0:

@@ -131,7 +131,7 @@ class Matched:
 def match_pieces(pieces: Sequence[Piece], reference: int, radius_px: int = RADIUS_PX) -> tuple[Matched, ...]:
     """Match the pieces of one point jointly. reference: index of the piece that defines the point; radius_px: of the
     patch. Returns the matched pieces in their order, with reasons where matching failed."""
-    fit = _Fit(pieces, reference, radius_px)
+    fit = _JointMatch(pieces, reference, radius_px)
     best: tuple[Matched, ...] = ()
     for smoothing_px in _SMOOTHING_PX:
         fit.run(smoothing_px)
@@ -148,7 +148,7 @@ def _area(matched: Sequence[Matched]) -> float:
     return float(np.mean([np.trace(each.covariance_px2) for each in matched]))
 
 
-class _Fit:
+class _JointMatch:
     """State of the joint matching: the geometry of every piece."""
 
     def __init__(self, pieces: Sequence[Piece], reference: int, radius_px: int) -> None:

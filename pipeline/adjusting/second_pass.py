@@ -17,7 +17,7 @@ from measure.scans.remote import fetch_location, scan_path
 from measure.targets.identification import TargetPrediction
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
-from pipeline.measuring.target_field import Field, checked_places, measure_single_targets, target_field
+from pipeline.measuring.target_field import TargetField, checked_places, measure_single_targets, target_field
 from pipeline.measuring.target_stage import replace_targets
 from pipeline.progress import Reporter
 from pipeline.results.measured_record import MeasuredScan
@@ -89,7 +89,7 @@ def looked_again(visit: SearchedAgain) -> tuple[MarkMeasurement, ...] | str:
 
 
 def _missed(
-    field: Field, scan: MeasuredScan, adjustment: Adjustment, settings: TargetSettings
+    field: TargetField, scan: MeasuredScan, adjustment: Adjustment, settings: TargetSettings
 ) -> tuple[TargetPrediction, ...]:
     """Predictions of the targets that were missed in a scan; not of those that a person decided about."""
     network, image = adjustment.network, scan.frame.image
@@ -113,7 +113,7 @@ def _missed(
 
 
 def _visited(
-    scan: MeasuredScan, seen: Sequence[MarkMeasurement] | str, field: Field, adjustment: Adjustment
+    scan: MeasuredScan, seen: Sequence[MarkMeasurement] | str, field: TargetField, adjustment: Adjustment
 ) -> MeasuredScan:
     """Scan with the targets found in the second pass; the same object if there are none."""
     if isinstance(seen, str):

@@ -8,7 +8,7 @@ from typing import Any
 from pipeline.archive.results_database import Store
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
-from pipeline.provenance import FileStates, Identity, fingerprint, hash_text, parts_hash
+from pipeline.provenance import FileIdentity, FileStates, fingerprint, hash_text, parts_hash
 from pipeline.results.adjustment_file import covariance_path, read_adjustment, read_own_covariance
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparator_file import ComparatorPoint
@@ -37,7 +37,7 @@ _ORIGIN = {"path", "source"}
 def measured_from(project: Project) -> MadeFrom:
     """Inputs of a measurement: every scan, what is sought in it, and the approximate values used to predict targets.
     The latter do not change a measured mark, but determine which ones are found and how they are named."""
-    known, files = dict[str, Identity](), FileStates(project.path.resolve().parent)
+    known, files = dict[str, FileIdentity](), FileStates(project.path.resolve().parent)
     if project.measurement_path.exists():
         with Store(project.measurement_path) as store:
             known = store.identities()
@@ -105,7 +105,7 @@ def adjusted_from(project: Project, marks: Sequence[ComparatorPoint]) -> MadeFro
     }
 
 
-def _parts(path: Path, known: Mapping[str, Identity], files: FileStates) -> tuple[int, str]:
+def _parts(path: Path, known: Mapping[str, FileIdentity], files: FileStates) -> tuple[int, str]:
     """Size of a scan's file and hash of its parts, read only where its state differs from that in the store."""
     state = files.get(path)
     found = known.get(state.uri)

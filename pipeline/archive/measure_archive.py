@@ -23,7 +23,7 @@ from pipeline.measuring.roll import add_known_lines
 from pipeline.measuring.scan_task import ScanTask, scan_tasks
 from pipeline.measuring.tie_stage import check_tie_names, tie_scans
 from pipeline.progress import Reporter
-from pipeline.provenance import FileStates, Identity, content_hash, parts_hash, shard_number
+from pipeline.provenance import FileIdentity, FileStates, content_hash, parts_hash, shard_number
 from pipeline.text.wording import counted, gathered
 from pipeline.workers import WorkOptions, cluster_executor, worker_pool
 
@@ -59,7 +59,7 @@ def find_touched(store: Store, project: Project) -> dict[str, str]:
         state = files.get(file)
         earlier, content = known.get(state.uri), hashes.get(state.uri)
         if earlier and content and state.is_touched(earlier.state) and content_hash(Path(file)) == content:
-            keys |= store.move(state.uri, Identity(state, earlier.parts_hash))
+            keys |= store.move(state.uri, FileIdentity(state, earlier.parts_hash))
     return keys
 
 
@@ -81,7 +81,7 @@ def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, 
             path = project.scans[name]
             uri = free.pop(content_hash(path), "") if state.bytes in sizes else ""
             if uri and uri not in taken:  # nor has another file come to its place
-                keys |= store.move(uri, Identity(state, parts_hash(path)))
+                keys |= store.move(uri, FileIdentity(state, parts_hash(path)))
                 taken.add(state.uri)
                 found += 1
     if unknown:

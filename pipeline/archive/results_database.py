@@ -28,7 +28,7 @@ from pipeline.archive.schema import (
 )
 from pipeline.archive.verdicts import Verdict, scan_doubt, scan_verdict
 from pipeline.errors import InputError
-from pipeline.provenance import FileState, Identity, hash_text, result_key
+from pipeline.provenance import FileIdentity, FileState, hash_text, result_key
 from pipeline.results.measured_record import (
     MeasuredScan,
     finite_or_none,
@@ -51,7 +51,7 @@ class Kept:
     camera: name of the camera's file.
     """
 
-    identity: Identity
+    identity: FileIdentity
     options_json: str
     scan: MeasuredScan
     bytes_read: int = 0
@@ -67,10 +67,12 @@ class Store(Database):
 
     # --- scans
 
-    def identities(self) -> dict[str, Identity]:
+    def identities(self) -> dict[str, FileIdentity]:
         """{uri: identity at its last measurement} of every scan ever measured."""
         query = f"select uri, bytes, mtime_ns, etag, identity_hash from scan where {is_sound('scan')}"
-        return {uri: Identity(FileState(uri, *state), parts) for uri, *state, parts in self.connection.execute(query)}
+        return {
+            uri: FileIdentity(FileState(uri, *state), parts) for uri, *state, parts in self.connection.execute(query)
+        }
 
     def fingerprints(self) -> dict[str, int]:
         """{fingerprint: row} of every sound result, read from the table itself and not from an index, which may be
@@ -211,7 +213,7 @@ class Store(Database):
             original = "(select id from scan where name = ?2)"
             self.connection.executemany(f"update scan set duplicate_of = {original} where uri = ?1", copies.items())
 
-    def move(self, uri: str, identity: Identity) -> dict[str, str]:
+    def move(self, uri: str, identity: FileIdentity) -> dict[str, str]:
         """Re-key the results of a scan whose file was moved or touched with unchanged content; return {old fingerprint:
         new}."""
         state = identity.state

@@ -13,14 +13,14 @@ from measure.flags import Cause, Code, Reason, Status
 from measure.results import MEASURE_REVISION, Covariance, MarkMeasurement
 from pipeline.archive.checked_results import Judging
 from pipeline.archive.schema import row_digest
-from pipeline.files.decisions_file import LEARNED, About, Choice, Decision, push_decision, standing
+from pipeline.files.decisions_file import LEARNED, About, Decision, DecisionKind, push_decision, standing
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import ScanTask, image_options
 from pipeline.provenance import fingerprint, hash_text
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import did_you_mean
 
-_MEASURED = (Choice.PLACE, Choice.POSE, Choice.UNDO)  # decisions that change the measurement
+_MEASURED = (DecisionKind.PLACE, DecisionKind.POSE, DecisionKind.UNDO)  # decisions that change the measurement
 _INAPPLICABLE = "decisions that do not apply"
 _NAMED = 10
 
@@ -90,8 +90,8 @@ def apply_decisions(
     current_keys = {key}  # of the results that a decision may refer to
     ever = set(current_keys)
     for one in decisions:
-        known = ever if one.decision is Choice.POSE else current_keys
-        if one.decision is not Choice.UNDO and one.fingerprint and one.fingerprint not in known:
+        known = ever if one.decision is DecisionKind.POSE else current_keys
+        if one.decision is not DecisionKind.UNDO and one.fingerprint and one.fingerprint not in known:
             continue
         before, old_key, counted = now, key, [*counted, one]
         now = _apply_to_task(task, standing(counted).values())
@@ -106,7 +106,7 @@ def apply_decisions(
 def before_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:
     """The scan with all decisions except acceptance, so that rejected and absent marks do not affect the checks of
     other scans."""
-    return _changed(scan, {about: one for about, one in counting.items() if one.decision is not Choice.ACCEPT})
+    return _changed(scan, {about: one for about, one in counting.items() if one.decision is not DecisionKind.ACCEPT})
 
 
 def after_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:
@@ -120,9 +120,9 @@ def after_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> Meas
 def _apply_to_task(task: ScanTask, decisions: Iterable[Decision]) -> ScanTask:
     clicks = list[Click]()
     for one in sorted(decisions, key=lambda one: one.subject):
-        if one.decision is Choice.POSE:
+        if one.decision is DecisionKind.POSE:
             task = task.changed(pose=one.pose)
-        elif one.decision is Choice.PLACE and one.subject[2] == "fiducial":
+        elif one.decision is DecisionKind.PLACE and one.subject[2] == "fiducial":
             assert one.col_px is not None
             assert one.row_px is not None
             clicks.append(Click(one.point, one.col_px, one.row_px))
@@ -139,17 +139,17 @@ def _apply_to_mark(mark: MarkMeasurement, decision: Decision | None) -> MarkMeas
         return mark
     by = f"by {decision.who or 'somebody'}{f' ({decision.note})' if decision.note else ''}"
     match decision.decision:
-        case Choice.ACCEPT if mark.covariance is not None and mark.center_px is not None:
+        case DecisionKind.ACCEPT if mark.covariance is not None and mark.center_px is not None:
             reason = Reason(
                 f"accepted {by}{f': {mark.reason}' if mark.reason else ''}", Code.DECIDED, *mark.reason.codes
             )
             return replace(mark, status=Status.MEASURED, reason=reason)
-        case Choice.REJECT:
+        case DecisionKind.REJECT:
             return replace(mark, status=Status.REJECTED, reason=Reason(f"rejected {by}", Code.DECIDED))
-        case Choice.ABSENT:
+        case DecisionKind.ABSENT:
             reason = Reason(f"absent, {by}", Code.DECIDED)
             return replace(mark, status=Status.ABSENT, center_px=None, covariance=None, reason=reason)
-        case Choice.PLACE if mark.kind != "fiducial":  # fiducials are matched from the clicked place
+        case DecisionKind.PLACE if mark.kind != "fiducial":  # fiducials are matched from the clicked place
             place = np.array([decision.col_px, decision.row_px], dtype=np.float64)
             covariance = Covariance({Cause.CLICK: CLICK_SIGMA_PX**2 * np.eye(2)})
             reason = Reason(f"placed {by}", Code.DECIDED)
@@ -213,7 +213,7 @@ def _known_images(
     for image, own in decisions.items():
         stacks = dict[About, list[Decision]]()
         for one in own:
-            if one.decision is Choice.UNDO and not stacks.get(one.subject):
+            if one.decision is DecisionKind.UNDO and not stacks.get(one.subject):
                 yield one.line, f"there is nothing to undo about {_named(one)}."
             push_decision(stacks, one)
         for about, stack in stacks.items():
@@ -229,7 +229,7 @@ def _why(one: Decision, counted: Decision | None, marks: Marks) -> str:
         return f"image {one.image!r} has no {kind} {point!r}.{hint}"
     if counted != one:
         return f"what was decided about {_named(one)} is of an earlier result. Look again in `reseau review`."
-    if one.decision is Choice.ACCEPT and not marks[point, kind]:
+    if one.decision is DecisionKind.ACCEPT and not marks[point, kind]:
         return f"nothing was measured of {_named(one)} that could be accepted. Place it in `reseau review`."
     return ""
 

@@ -22,7 +22,7 @@ from pipeline.files.project_file import Project
 from pipeline.measuring.scan_measurement import MeasuredFile, ended_scan, measure_file, reads_writing
 from pipeline.measuring.scan_task import ScanTask
 from pipeline.progress import Reporter
-from pipeline.provenance import FileState, FileStates, Identity, hash_text, parts_hash, result_key
+from pipeline.provenance import FileIdentity, FileState, FileStates, hash_text, parts_hash, result_key
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import count_sentence, counted, drop_file_name, listed
 from pipeline.types import Array
@@ -120,7 +120,7 @@ class Work:
             self._states[task.scan] = self._files.get(scan_path(task.scan))
         return self._states[task.scan]
 
-    def _identity(self, task: ScanTask) -> Identity | None:
+    def _identity(self, task: ScanTask) -> FileIdentity | None:
         """Stored identity of the task's file; None if it is unknown or has changed."""
         state = self.state(task)
         known = self._identities.get(state.uri)
@@ -166,7 +166,7 @@ class Work:
         for task in tasks:
             identity, reviewed = self._identity(task), task
             if decisions := self.decisions.get(task.name):
-                reviewed_file = identity or Identity(self.state(task), parts_hash(scan_path(task.scan)))
+                reviewed_file = identity or FileIdentity(self.state(task), parts_hash(scan_path(task.scan)))
                 reviewed, self.counting[task.name] = review_decisions.apply_decisions(
                     task, decisions, partial(_key, reviewed_file), pose_of
                 )
@@ -186,7 +186,7 @@ class Work:
             self.state(task)  # before the measurement
         for task, result in iterate_results(measure_file, tasks, self._executor, TASKS_A_CORE * self._at_a_time):
             file = result if isinstance(result, MeasuredFile) else MeasuredFile(ended_scan(task, result), "", -1)
-            identity, camera = Identity(self.state(task), file.parts_hash), self._project.image_camera(task.name)
+            identity, camera = FileIdentity(self.state(task), file.parts_hash), self._project.image_camera(task.name)
             if not file.parts_hash:  # the process was lost
                 identity = self._identity(task) or identity
             kept = Kept(identity, _options_json(task), file.scan, file.bytes_read, camera.path.name)
@@ -205,6 +205,6 @@ def _options_json(task: ScanTask) -> str:
     return f'{json[:-1]},"reads":true}}' if reads_writing(task.options) else json
 
 
-def _key(identity: Identity, task: ScanTask) -> str:
+def _key(identity: FileIdentity, task: ScanTask) -> str:
     """Fingerprint of the result of a task."""
     return result_key(identity, _hash_of(_options_json(task)))

@@ -108,7 +108,7 @@ class BlockPicture:
 
 
 @dataclass(frozen=True)
-class Sight:
+class TrackObservation:
     """Observation of a track in an image.
 
     Attributes
@@ -134,7 +134,7 @@ class Mapped:
     """
 
     poses: dict[str, tuple[Array, Array]]
-    tracks: dict[int, list[Sight]]
+    tracks: dict[int, list[TrackObservation]]
 
 
 @dataclass(frozen=True)
@@ -195,12 +195,12 @@ def feature_precision(mapped: Mapped) -> FeaturePrecision:
     return precision
 
 
-def _squares_px2(track: Sequence[Sight]) -> Array:
+def _squares_px2(track: Sequence[TrackObservation]) -> Array:
     """(n,) mean squared reprojection error of a coordinate, px²."""
     return np.array([sight.off_px**2 / 2.0 for sight in track])
 
 
-def _design(track: Sequence[Sight]) -> Array:
+def _design(track: Sequence[TrackObservation]) -> Array:
     """(n, 2) design matrix: coefficients of grain² and share² in the expectation of these squares.
 
     With the redundancy f of a coordinate, the variance of a residual is f² times the observation's own plus f (1 - f)
@@ -529,7 +529,7 @@ def read_model(model: Any, database: Any, pictures: Sequence[BlockPicture]) -> M
             off_px = float(np.linalg.norm(place_px - image.project_point(point.xyz)))
             place = place_px - COLMAP.first_pixel_px
             size_px = float(sizes_px[element.image_id][row])
-            sights.append(Sight(names[image.name], float(place[0]), float(place[1]), size_px, off_px))
+            sights.append(TrackObservation(names[image.name], float(place[0]), float(place[1]), size_px, off_px))
         tracks[int(number)] = sights
     return Mapped(poses, tracks)
 

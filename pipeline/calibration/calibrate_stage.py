@@ -51,7 +51,7 @@ LENSES: dict[str, LensSetting] = {"auto": "auto", **{model: model for model in g
 
 
 @dataclass(frozen=True, repr=False)
-class Calibration(PlottedResult):
+class CalibrationResult(PlottedResult):
     """Calibrated cameras, and the reasons why others are not calibrated.
 
     Attributes
@@ -143,7 +143,7 @@ class Calibration(PlottedResult):
 
 def _calibrated(
     given: Sequence[Path], out: Path, options: CalibrationOptions, reporter: Reporter, workers: int | None
-) -> Calibration:
+) -> CalibrationResult:
     """Calibrate each camera separately, so that a failure does not affect the others."""
     pictures = find_pictures(given, out)
     first: LensModel = "opencv4" if options.lens == "auto" else options.lens
@@ -200,7 +200,7 @@ def _calibrated(
     for path, text in files.items():
         write_atomically(path, text)
     written = (*files, project.report_path, project.path)
-    return Calibration(
+    return CalibrationResult(
         tuple(found), pictures.unreadable, not_calibrated, written, summary, adjustments, options.pixel_mm
     )
 
@@ -285,7 +285,7 @@ def calibrate(
     ros: bool = False,
     workers: int | None = None,
     reporter: Reporter | None = None,
-) -> Calibration:
+) -> CalibrationResult:
     """Calibrate digital cameras from images of a board, as `reseau calibrate` does.
 
     Parameters

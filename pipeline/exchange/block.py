@@ -19,7 +19,7 @@ from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.files.project_tables import UNITS_MM
 from pipeline.resampling.canvas import FrameChain, image_chain
-from pipeline.results.adjustment_file import Covariance, read_own_covariance
+from pipeline.results.adjustment_file import ParameterCovariance, read_own_covariance
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparator_file import ComparatorPoint, pixel_from_comparator, read_comparator, read_pitches
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit
@@ -143,7 +143,7 @@ class WholeFrame(OutFrame):
 
 
 @dataclass(frozen=True)
-class Block:
+class ImageBlock:
     """The images of a project, sorted by name. adjustment: None where none is valid."""
 
     project: Project
@@ -151,7 +151,7 @@ class Block:
     adjustment: AdjustmentRecord | None
 
     @cached_property
-    def covariance(self) -> Covariance:
+    def covariance(self) -> ParameterCovariance:
         return read_own_covariance(self.project.adjustment_path)
 
     @cached_property
@@ -216,7 +216,7 @@ class Block:
             )
 
 
-def read_block(project: Project) -> Block:
+def read_block(project: Project) -> ImageBlock:
     """Read the measurements and the adjustment of a project.
 
     Raises
@@ -236,7 +236,7 @@ def read_block(project: Project) -> Block:
         _frame(project, adjustment, image, tuple(own), pitches.get(image, project.pitch_um))
         for image, own in sorted(by_image.items())
     ]
-    return Block(project, tuple(frames), adjustment)
+    return ImageBlock(project, tuple(frames), adjustment)
 
 
 def _frame(

@@ -20,7 +20,7 @@ from pipeline.files.mark_table import Picture, picture_file
 from pipeline.files.project_file import read_project
 from pipeline.provenance import hash_content
 from pipeline.results.adjustment_file import (
-    Covariance,
+    ParameterCovariance,
     covariance_path,
     observed_mm,
     read_adjustment,
@@ -177,7 +177,9 @@ def _parameters(camera: str, lens: Lens) -> tuple[Parameter, ...]:
     return tuple(Parameter.interior(camera, each) for each in lens.quantities)
 
 
-def _moved_covariance(covariance: Covariance, camera: str, source: Lens, lens: ConvertedLens) -> Covariance:
+def _moved_covariance(
+    covariance: ParameterCovariance, camera: str, source: Lens, lens: ConvertedLens
+) -> ParameterCovariance:
     """Covariance of all parameters after the conversion of one camera, by the derivatives of its lens."""
     old, new = _parameters(camera, source), _parameters(camera, lens.lens)
     others = tuple(each for each in covariance.parameters if each not in old)
@@ -188,7 +190,7 @@ def _moved_covariance(covariance: Covariance, camera: str, source: Lens, lens: C
     value = dict(zip(covariance.parameters, covariance.values, strict=True))
     values = np.concatenate([lens.lens.values, [value[each] for each in others]])
     clusters = covariance.clusters and _moved_covariance(covariance.clusters, camera, source, lens)
-    return Covariance((*new, *others), values, (matrix + matrix.T) / 2.0, clusters=clusters)
+    return ParameterCovariance((*new, *others), values, (matrix + matrix.T) / 2.0, clusters=clusters)
 
 
 def _camera_entry(camera: CameraRecord, source: Distortion, lens: ConvertedLens, sigmas: Array) -> CameraRecord:

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.exchange.block import Block, WholeFrame
+from pipeline.exchange.block import ImageBlock, WholeFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.pinhole import frame_corners_mm
 from pipeline.types import Array
@@ -72,7 +72,7 @@ def _from_utm(xy: Array, zone: int, southern: bool) -> Array:
     return np.asarray(np.degrees(np.column_stack([lon, np.arctan(tan)])) + np.array([6.0 * zone - 183.0, 0.0]))
 
 
-def write_geojson(block: Block, options: ExportOptions) -> Written:
+def write_geojson(block: ImageBlock, options: ExportOptions) -> Written:
     """Write footprints.geojson: outlines of the frames, projected by the adjusted lens and orientation to the mean
     height of their points."""
     crs = block.project.crs
@@ -106,7 +106,7 @@ def write_geojson(block: Block, options: ExportOptions) -> Written:
     return Written({"footprints.geojson": json.dumps(content, ensure_ascii=False) + "\n"}, lost, notes, tuple(left_out))
 
 
-def footprint(block: Block, frame: WholeFrame) -> Array | str:
+def footprint(block: ImageBlock, frame: WholeFrame) -> Array | str:
     """Outline (n, 3) in object coordinates of a frame on level ground, counter-clockwise from the lower left corner, or
     the reason why there is none."""
     model = frame.model

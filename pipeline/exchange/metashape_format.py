@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pipeline.adjusting.picture_turn import NOT_TURNED
 from pipeline.errors import InputError
-from pipeline.exchange.block import Block, OutFrame
+from pipeline.exchange.block import ImageBlock, OutFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import ImportOptions, Incoming, child_numbers, opencv_camera, read_xml, xml_text
 from pipeline.exchange.micmac_format import TURNED, camera_box
@@ -28,7 +28,7 @@ _MOST_REASONS = 3  # largest number in a message
 NAMES = ("f", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "b1", "b2")
 
 
-def write_metashape(block: Block, options: ExportOptions) -> Written:
+def write_metashape(block: ImageBlock, options: ExportOptions) -> Written:
     """Write reseau_to_metashape.py with its data, and CAMERA.xml where there is an adjustment; of digital cameras
     CAMERA.xml alone."""
     reasons = {frame.image: _hindrance(block, frame) for frame in block.frames}
@@ -67,7 +67,7 @@ def write_metashape(block: Block, options: ExportOptions) -> Written:
     return Written(files, lost, tuple(notes), left_out)
 
 
-def _hindrance(block: Block, frame: OutFrame) -> str:
+def _hindrance(block: ImageBlock, frame: OutFrame) -> str:
     """Reason why an image cannot be exported; "" where it can."""
     if not block.camera_file(frame.camera).fiducials:
         without = "it has no adjusted orientation, and no fiducials." if not frame.is_oriented else ""
@@ -82,7 +82,7 @@ def _hindrance(block: Block, frame: OutFrame) -> str:
     return ""
 
 
-def _camera(block: Block, name: str, files: dict[str, str | bytes]) -> dict[str, object]:
+def _camera(block: ImageBlock, name: str, files: dict[str, str | bytes]) -> dict[str, object]:
     file = block.camera_file(name)
     adjusted = block.adjustment.cameras.get(name) if block.adjustment else None
     calibration = f"{file_word(name)}.xml"

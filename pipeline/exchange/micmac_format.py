@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.adjusting.picture_turn import NOT_TURNED
 from pipeline.errors import InputError
-from pipeline.exchange.block import Block, OutFrame
+from pipeline.exchange.block import ImageBlock, OutFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import (
     Y_DOWN_Z_FORWARD,
@@ -53,7 +53,7 @@ TURNED = "its picture is turned (column turned_deg). Turn the file back, and cal
 _FEWEST = 3  # marks needed for an affine transformation
 
 
-def write_micmac(block: Block, options: ExportOptions) -> Written:
+def write_micmac(block: ImageBlock, options: ExportOptions) -> Written:
     """Write Ori-InterneScan with the fiducials and, where there is an adjustment, Ori-Reseau with camera and
     orientations.
 
@@ -75,7 +75,7 @@ def write_micmac(block: Block, options: ExportOptions) -> Written:
     )
 
 
-def _camera_files(block: Block, camera: str, options: ExportOptions) -> Written:
+def _camera_files(block: ImageBlock, camera: str, options: ExportOptions) -> Written:
     frames = [frame for frame in block.frames if frame.camera == camera]
     fiducials = {id: np.array(place) * _Y_DOWN for id, place in block.fiducials_mm(camera).items()}
     files: dict[str, str | bytes] = {}
@@ -123,7 +123,7 @@ def _camera_files(block: Block, camera: str, options: ExportOptions) -> Written:
     return Written(files, notes=tuple(notes), left_out=left_out)
 
 
-def film_box(block: Block, frame: OutFrame, options: ExportOptions) -> Canvas:
+def film_box(block: ImageBlock, frame: OutFrame, options: ExportOptions) -> Canvas:
     """Canvas for ReSampFid: the exposed frame, at whole multiples of the pitch, never the bounding box of the marks."""
     pitch = options.pitch_um or float(np.sqrt(np.prod(frame.known_pitch_um)))
     corners = frame_corners_mm(block, frame) / (pitch / 1000.0)
@@ -132,7 +132,7 @@ def film_box(block: Block, frame: OutFrame, options: ExportOptions) -> Canvas:
     return Canvas(left * pitch / 1000.0, top * pitch / 1000.0, pitch / 1000.0, width, height)
 
 
-def camera_box(block: Block, frame: OutFrame, options: ExportOptions) -> Canvas:
+def camera_box(block: ImageBlock, frame: OutFrame, options: ExportOptions) -> Canvas:
     """Canvas of a camera's frames: `film_box`, or a digital camera's picture, which is not resampled.
 
     Raises InputError for a picture whose pixels are not square.
@@ -200,7 +200,7 @@ def _orientation(frame: OutFrame, calibration: str) -> str:
     return xml_text("ExportAPERO", {"OrientationConique": content})
 
 
-def _measures(block: Block, frames: Sequence[OutFrame], box: Canvas, reech: str) -> str:
+def _measures(block: ImageBlock, frames: Sequence[OutFrame], box: Canvas, reech: str) -> str:
     """The object points' marks in the frames created by ReSampFid, or in a digital camera's images."""
     images = []
     for frame in frames:
@@ -212,7 +212,7 @@ def _measures(block: Block, frames: Sequence[OutFrame], box: Canvas, reech: str)
     return xml_text("SetOfMesureAppuisFlottants", images)
 
 
-def _ground(block: Block) -> str:
+def _ground(block: ImageBlock) -> str:
     assert block.adjustment is not None
     points: list[tuple[str, Content]] = []
     for id, place in block.points.items():
@@ -281,7 +281,7 @@ MMVII = Convention(
 _FOLDERS = {True: "Fiducials", False: "Targets"}
 
 
-def write_mmvii(block: Block, options: ExportOptions) -> Written:
+def write_mmvii(block: ImageBlock, options: ExportOptions) -> Written:
     """Write MMVII-PhgrProj/PointsMeasure/{Fiducials, Targets}/MesIm-IMAGE.xml."""
     kinds = [(frame, folder, frame.observed(is_f)) for frame in block.frames for is_f, folder in _FOLDERS.items()]
     files = {

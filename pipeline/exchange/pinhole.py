@@ -22,7 +22,7 @@ from adjust.functional_model.lens_conversion import convert_lens, frame_grid_mm
 from adjust.functional_model.projection import STRAIGHT
 from measure.errors import MeasurementError
 from pipeline.errors import InputError, missing_extra
-from pipeline.exchange.block import Block, OutFrame, WholeFrame
+from pipeline.exchange.block import ImageBlock, OutFrame, WholeFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.exchange.incoming import (
     Y_DOWN_Z_FORWARD,
@@ -99,7 +99,9 @@ class FittedLens:
         return float(self.lens.parameters[-1])
 
 
-def nearest_lens(block: Block, frame: OutFrame, models: Sequence[Sequence[str]], options: ExportOptions) -> FittedLens:
+def nearest_lens(
+    block: ImageBlock, frame: OutFrame, models: Sequence[Sequence[str]], options: ExportOptions
+) -> FittedLens:
     """Fit the lens of an image's camera in one of several models, each given by names of OpenCV's parameters.
 
     The first model that is identical is taken; else the first that is close enough; else the closest. If the lens
@@ -123,7 +125,7 @@ def nearest_lens(block: Block, frame: OutFrame, models: Sequence[Sequence[str]],
     return min(fits, key=lambda each: each.largest_mm)
 
 
-def sheared_lens(block: Block, frame: OutFrame, at_ideal: bool) -> FittedLens:
+def sheared_lens(block: ImageBlock, frame: OutFrame, at_ideal: bool) -> FittedLens:
     """The lens of an image's camera with k1, k2, k3, p1, p2, affinity and shear.
 
     Parameters
@@ -151,7 +153,7 @@ def sheared_lens(block: Block, frame: OutFrame, at_ideal: bool) -> FittedLens:
     return FittedLens(fitted, float(np.linalg.norm(left_mm, axis=1).max()))
 
 
-def frame_corners_mm(block: Block, frame: OutFrame) -> Array:
+def frame_corners_mm(block: ImageBlock, frame: OutFrame) -> Array:
     """(2, 2) opposite corners of the exposed frame or the picture, camera mm: from the camera file, or the extent of
     the observations."""
     camera = block.camera_file(frame.camera)
@@ -181,7 +183,7 @@ def _has_only(lens: Lens, names: Sequence[str]) -> bool:
     return family == "opencv" and not any(value for name, value in known if name not in names)
 
 
-def _fit_opencv(block: Block, frame: OutFrame, names: Sequence[str]) -> FittedLens:
+def _fit_opencv(block: ImageBlock, frame: OutFrame, names: Sequence[str]) -> FittedLens:
     """Fit parameters of these names in OpenCV's model."""
     lens = frame.lens
     family = lens.distortion.family
@@ -264,7 +266,7 @@ class PinholeFrame:
 
 
 def pinhole_frames(
-    block: Block, options: ExportOptions, models: Sequence[Sequence[str]], format: str
+    block: ImageBlock, options: ExportOptions, models: Sequence[Sequence[str]], format: str
 ) -> tuple[list[PinholeFrame], list[str]]:
     """Pinhole frames of every oriented image.
 
@@ -295,7 +297,7 @@ def pinhole_frames(
 
 
 def checked_misfits(
-    block: Block, frames: Sequence[OutFrame], lens: FittedLens, box: Canvas, options: ExportOptions, format: str
+    block: ImageBlock, frames: Sequence[OutFrame], lens: FittedLens, box: Canvas, options: ExportOptions, format: str
 ) -> float:
     """Largest misfit, px, of a lens over a camera's images. Raises InputError where it is larger than the options
     allow."""
@@ -315,7 +317,7 @@ def _check_misfit(misfit_px: dict[str, float], options: ExportOptions, format: s
         )
 
 
-def sight_misfit_mm(block: Block, frame: OutFrame) -> float:
+def sight_misfit_mm(block: ImageBlock, frame: OutFrame) -> float:
     """Largest shift of an image's points by refraction and earth curvature, which other programs do not model."""
     model = frame.model
     assert model is not None
@@ -328,7 +330,7 @@ def sight_misfit_mm(block: Block, frame: OutFrame) -> float:
     return float(np.linalg.norm(bent - straight, axis=1).max())
 
 
-def _pinhole(block: Block, frame: WholeFrame, lens: FittedLens, options: ExportOptions) -> PinholeFrame:
+def _pinhole(block: ImageBlock, frame: WholeFrame, lens: FittedLens, options: ExportOptions) -> PinholeFrame:
     """Pinhole of one frame. Raises MeasurementError where the lens folds within the scan."""
     pitch_um = options.pitch_um or float(np.sqrt(np.prod(frame.known_pitch_um)))
     scans, is_as_taken = [], frame.is_as_taken and not options.with_lens and frame.pitch_um == (pitch_um, pitch_um)
@@ -358,7 +360,7 @@ def pinholes_written(
     return Written(files, (*film, "all standard deviations", lost), (pictures, *notes), tuple(left_out))
 
 
-def write_asp(block: Block, options: ExportOptions) -> Written:
+def write_asp(block: ImageBlock, options: ExportOptions) -> Written:
     """Write NAME.tsai for each image; c and principal point in mm, with the pitch in mm."""
     frames, left_out = pinhole_frames(block, options, (BROWN,), "asp")
     return pinholes_written(
@@ -393,7 +395,7 @@ def _tsai(frame: PinholeFrame) -> str:
     return "\n".join(lines) + "\n"
 
 
-def write_opencv(block: Block, options: ExportOptions) -> Written:
+def write_opencv(block: ImageBlock, options: ExportOptions) -> Written:
     """Write NAME.yml for each image, for cv2.FileStorage."""
     frames, left_out = pinhole_frames(block, options, (BROWN, PRISMS, NAMES[4:]), "opencv")
     files = {f"{frame.frame.image}.yml": _yaml(frame, block.lens_reach.get(frame.frame.camera)) for frame in frames}
@@ -441,7 +443,7 @@ def import_opencv(paths: Sequence[Path], options: ImportOptions) -> Incoming:
     return Incoming(cameras=tuple(cameras), poses=tuple(poses))
 
 
-def write_colmap(block: Block, options: ExportOptions) -> Written:
+def write_colmap(block: ImageBlock, options: ExportOptions) -> Written:
     """Write sparse/*.bin with one camera per image, since every resampled frame has its own origin."""
     pycolmap = import_pycolmap("the format colmap")
     frames, left_out = pinhole_frames(block, options, (BROWN, RATIONAL), "colmap")
@@ -460,7 +462,7 @@ def import_pycolmap(user: str) -> Any:
     return pycolmap
 
 
-def _reconstruction(pycolmap: Any, block: Block, frames: list[PinholeFrame]) -> Any:
+def _reconstruction(pycolmap: Any, block: ImageBlock, frames: list[PinholeFrame]) -> Any:
     """Reconstruction of the frames with the marks of adjusted points, and of these points with their tracks.
 
     Cameras are of the model OPENCV, FULL_OPENCV if the lens has a third radial term, or OPENCV_FISHEYE.

@@ -22,7 +22,7 @@ from pipeline.files.camera_tables import Source
 from pipeline.files.earlier_calibration import EarlierCalibration
 from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_file import Project
-from pipeline.results.adjustment_file import Covariance, read_own_covariance, write_with_covariance
+from pipeline.results.adjustment_file import ParameterCovariance, read_own_covariance, write_with_covariance
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, FiducialRecord, Quantity
 from pipeline.results.comparator_file import read_comparator
 from pipeline.text.files import write_atomically
@@ -121,7 +121,7 @@ def _save(calibrations: Sequence[_Calibration], path: Path) -> SavedCamera:
     labels = {one.label_in_camera: value for one, value in spread.items()}
     source = Source(text=text, frames=frames, scanners=scanners, archives=len(calibrations), spread_mm=labels)
     earlier = path.with_name(f"{path.stem}-calibration.json")
-    write_with_covariance(earlier, record, Covariance(first.parameters, values, covariance).arrays)
+    write_with_covariance(earlier, record, ParameterCovariance(first.parameters, values, covariance).arrays)
     camera = _adjusted_camera(first, record.cameras[first.camera.name], earlier, path, source)
     body = camera_text(camera, picture_writer(path.parent, f"{path.stem}-"))
     write_atomically(path, f"{_HEAD}: values, and in {earlier.name} their covariance.\n{body}")

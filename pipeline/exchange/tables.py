@@ -8,7 +8,7 @@ import numpy as np
 
 from adjust.problem.parameter import Parameter
 from pipeline.errors import InputError, missing_extra
-from pipeline.exchange.block import Block, OutFrame
+from pipeline.exchange.block import ImageBlock, OutFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
 from pipeline.results.adjustment_record import AdjustmentRecord, Quantity
 from pipeline.results.comparator_file import ComparatorPoint
@@ -25,7 +25,7 @@ Row = dict[str, Cell]
 Table = dict[str, list[Cell]]
 
 
-def write_csv(block: Block, options: ExportOptions) -> Written:
+def write_csv(block: ImageBlock, options: ExportOptions) -> Written:
     """Write one CSV file per table; numbers with all their digits."""
     head = f"# {CSV.axes}; the CENTRE of the top-left pixel is (0, 0)"
     files = {}
@@ -35,7 +35,7 @@ def write_csv(block: Block, options: ExportOptions) -> Written:
     return Written(files)
 
 
-def write_parquet(block: Block, options: ExportOptions) -> Written:
+def write_parquet(block: ImageBlock, options: ExportOptions) -> Written:
     """Write one Parquet file per table. Raises InputError where pyarrow is not installed."""
     try:
         import pyarrow
@@ -51,7 +51,7 @@ def write_parquet(block: Block, options: ExportOptions) -> Written:
     return Written(files)
 
 
-def tables(block: Block) -> Mapping[str, Table]:
+def tables(block: ImageBlock) -> Mapping[str, Table]:
     """Tables by name; cells without a value are None. Angles in degrees, their covariances in rad as in
     adjustment.npz."""
     rows: dict[str, Iterable[Row]] = {"marks": (_mark(frame, mark) for frame in block.frames for mark in frame.marks)}
@@ -101,7 +101,7 @@ def _mark(frame: OutFrame, mark: ComparatorPoint) -> Row:
     }
 
 
-def _transformations(adjustment: AdjustmentRecord, block: Block) -> Iterable[Row]:
+def _transformations(adjustment: AdjustmentRecord, block: ImageBlock) -> Iterable[Row]:
     for frame in block.frames:
         if frame.model is not None:
             film = adjustment.images[frame.image].transformation
@@ -109,7 +109,7 @@ def _transformations(adjustment: AdjustmentRecord, block: Block) -> Iterable[Row
             yield from _parameters(known, film.parameters)
 
 
-def _covariances(block: Block) -> Iterable[Row]:
+def _covariances(block: ImageBlock) -> Iterable[Row]:
     """Covariances of each image's orientation and film: lower triangle; mm, object units and rad."""
     of_image: dict[str, list[Parameter]] = {}
     for each in block.covariance.parameters:
@@ -162,7 +162,7 @@ BINGO = Convention(
 )
 
 
-def write_bingo(block: Block, options: ExportOptions) -> Written:
+def write_bingo(block: ImageBlock, options: ExportOptions) -> Written:
     """Write bingo.txt with the corrected coordinates of every point of every adjusted image."""
     block.needs_orientation("bingo")
     _check_words(frame.image for frame in block.frames)

@@ -35,7 +35,7 @@ KINDS = ("fiducial", "target", "tie")
 LEARNED = "learned"  # kind of decisions about the appearance of a camera's marks, not about their places
 
 
-class Choice(MeaningfulWord):
+class DecisionKind(MeaningfulWord):
     """Kinds of decisions."""
 
     ACCEPT = "accept", "The mark is right as it was measured: it counts as `measured`."
@@ -88,7 +88,7 @@ class Decision:
     """
 
     image: Text
-    decision: Choice
+    decision: DecisionKind
     point: Text = ""
     kind: Annotated[Text, _word_validator(*KINDS, LEARNED)] = ""
     col_px: Pixels | None = None
@@ -108,15 +108,19 @@ class Decision:
         return self.image, self.point, self.kind or (KINDS[0] if self.point else "")
 
 
-_REQUIRED: Mapping[Choice, tuple[str, ...]] = {
-    **dict.fromkeys(Choice, ("image", "point")),
-    Choice.PLACE: ("image", "point", "col_px", "row_px"),
-    Choice.POSE: ("image", "pose"),
-    Choice.LEARN: ("image", "px"),
-    Choice.UNDO: ("image",),
+_REQUIRED: Mapping[DecisionKind, tuple[str, ...]] = {
+    **dict.fromkeys(DecisionKind, ("image", "point")),
+    DecisionKind.PLACE: ("image", "point", "col_px", "row_px"),
+    DecisionKind.POSE: ("image", "pose"),
+    DecisionKind.LEARN: ("image", "px"),
+    DecisionKind.UNDO: ("image",),
 }
 _KEYS = tuple(each.name for each in fields(Decision) if each.name != "line")
-_WORDS: Mapping[str, tuple[str, ...]] = {"decision": tuple(map(str, Choice)), "kind": (*KINDS, LEARNED), "pose": POSES}
+_WORDS: Mapping[str, tuple[str, ...]] = {
+    "decision": tuple(map(str, DecisionKind)),
+    "kind": (*KINDS, LEARNED),
+    "pose": POSES,
+}
 _MUST_BE = {
     **dict.fromkeys(_KEYS, "text"),
     **{key: f"one of {', '.join(words)}" for key, words in _WORDS.items()},
@@ -136,15 +140,15 @@ def _check_decision(decision: Decision) -> Decision:
         if not value and value != 0.0:
             message = f"must be {_MUST_BE[key]}, not None." if _MUST_BE[key] != "text" else "is missing."
             raise WrongKey(key, message)
-    of_scan = kind in (Choice.POSE, Choice.LEARN)
+    of_scan = kind in (DecisionKind.POSE, DecisionKind.LEARN)
     if of_scan and decision.point:
-        what = "a scan orientation" if kind is Choice.POSE else "what is learned"
+        what = "a scan orientation" if kind is DecisionKind.POSE else "what is learned"
         raise WrongKey("point", f"is of no use: {what} is of the whole scan. Take it out.")
-    if of_scan and decision.kind != (own := LEARNED if kind is Choice.LEARN else ""):
+    if of_scan and decision.kind != (own := LEARNED if kind is DecisionKind.LEARN else ""):
         decision = replace(decision, kind=own)
-    if decision.px and kind is not Choice.LEARN:
+    if decision.px and kind is not DecisionKind.LEARN:
         decision = replace(decision, px={})
-    return replace(decision, pose="") if decision.pose and kind is not Choice.POSE else decision
+    return replace(decision, pose="") if decision.pose and kind is not DecisionKind.POSE else decision
 
 
 _DECISION = TypeAdapter(Annotated[Decision, AfterValidator(_check_decision)])
@@ -301,7 +305,7 @@ def standing(decisions: Sequence[Decision]) -> Mapping[About, Decision]:
 def push_decision(stacks: dict[About, list[Decision]], decision: Decision) -> None:
     """Push a decision onto the stack of its subject; an undo pops the last one."""
     stack = stacks.setdefault(decision.subject, [])
-    if decision.decision is not Choice.UNDO:
+    if decision.decision is not DecisionKind.UNDO:
         stack.append(decision)
     elif stack:
         stack.pop()

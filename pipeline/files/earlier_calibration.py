@@ -13,7 +13,7 @@ from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.observations import Calibration
 from adjust.problem.parameter import Parameter
 from pipeline.files.camera_tables import SigmaTable
-from pipeline.results.adjustment_file import Covariance, covariance_path, read_adjustment, read_covariance
+from pipeline.results.adjustment_file import ParameterCovariance, covariance_path, read_adjustment, read_covariance
 from pipeline.results.adjustment_record import CameraRecord, DistortionRecord
 from pipeline.text.tables import Table
 from pipeline.types import Array
@@ -96,7 +96,9 @@ def read_calibration(sigma: Table, given: SigmaTable, camera: Camera) -> Earlier
     return earlier
 
 
-def _check_agreement(sigma: Table, path: Path, name: str, camera: CameraRecord, covariance: Covariance) -> None:
+def _check_agreement(
+    sigma: Table, path: Path, name: str, camera: CameraRecord, covariance: ParameterCovariance
+) -> None:
     """Check that JSON and covariance file agree on the camera; the network uses the latter."""
     stored = {Parameter.interior(name, key): quantity for key, quantity in camera.interior.items()}
     for id, mark in camera.fiducials.items():
@@ -161,7 +163,9 @@ def _check_family(sigma: Table, path: Path, earlier: DistortionRecord, distortio
             )
 
 
-def _calibration(path: Path, covariance: Covariance, there: str, camera: Camera, fiducials: bool) -> EarlierCalibration:
+def _calibration(
+    path: Path, covariance: ParameterCovariance, there: str, camera: Camera, fiducials: bool
+) -> EarlierCalibration:
     parameters = [Parameter.interior(there, name) for name in (*INTERIOR, *parameter_names(camera.distortion.family))]
     if fiducials:
         parameters += [Parameter.fiducial(there, id, axis) for id in camera.fiducials for axis in "xy"]

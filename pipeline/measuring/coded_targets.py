@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from measure.flags import NO_REASON, SHEET_POINT_ELSEWHERE, SHEET_POINT_OFF_PLACE, Code, Reason, Status
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
-from measure.targets.block_search import Candidate
+from measure.targets.block_search import TargetCandidate
 from measure.targets.consistency import (
     FLAT,
     ImagePoints,
@@ -29,7 +29,7 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
-from pipeline.measuring.target_field import Field, absent_targets, checked_places
+from pipeline.measuring.target_field import TargetField, absent_targets, checked_places
 from pipeline.measuring.target_identification import NamedField, camera_model, name_field
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import did_you_mean, listed
@@ -97,7 +97,7 @@ class _CodedDots:
     none_named : reason why no dot is identified by its code, if none is.
     """
 
-    found: Sequence[Candidate]
+    found: Sequence[TargetCandidate]
     read: Mapping[int, int]
     named: dict[int, int]
     notes: tuple[str, ...]
@@ -160,13 +160,13 @@ def measure_sheet(scan: Scan, sheet: CodedPoints) -> tuple[tuple[MarkMeasurement
     return tuple(marks.values()), notes
 
 
-def _sign(found: Sequence[Candidate], coded: dict[int, int]) -> float:
+def _sign(found: Sequence[TargetCandidate], coded: dict[int, int]) -> float:
     """1 for light coded dots, -1 for dark ones."""
     return float(np.sign(np.sum([np.sign(found[dot].contrast_dn) for dot in coded]))) or 1.0
 
 
 def measure_coded_field(
-    scan: Scan, points: CodedPoints, field: Field, camera: CameraFile, measured: MeasuredScan
+    scan: Scan, points: CodedPoints, field: TargetField, camera: CameraFile, measured: MeasuredScan
 ) -> tuple[tuple[MarkMeasurement, ...], tuple[str, ...]]:
     """Measure every point of a field in space. Returns a mark for each, and notes."""
     scan = scan.green_channel()
@@ -199,7 +199,7 @@ def measure_coded_field(
     return checked_places(marks, field, named.model, measured), notes
 
 
-def _contradiction(prediction: TargetPrediction, misread: Sequence[tuple[str, Candidate]]) -> Reason:
+def _contradiction(prediction: TargetPrediction, misread: Sequence[tuple[str, TargetCandidate]]) -> Reason:
     """Reason to reject a point if a ring at its place has another code."""
     reach = float(prediction.half_axes_px[0]) + prediction.search_px
     for id, dot in misread:
@@ -208,7 +208,7 @@ def _contradiction(prediction: TargetPrediction, misread: Sequence[tuple[str, Ca
     return NO_REASON
 
 
-def _set_dot_size(field: Field, named: NamedField, measured: MeasuredScan) -> Field:
+def _set_dot_size(field: TargetField, named: NamedField, measured: MeasuredScan) -> TargetField:
     """Estimate the radius of the dots from the candidates, where the project does not give it."""
     if field.radius > 0.0:
         return field

@@ -11,7 +11,7 @@ from adjust.functional_model.rotation import rotation_from_vector
 from measure.flags import TARGET_ELSEWHERE, TARGET_OFF_PLACE, Code, Reason, Status
 from measure.results import MarkMeasurement
 from measure.scans.scan import Scan
-from measure.targets.block_search import Candidate
+from measure.targets.block_search import TargetCandidate
 from measure.targets.consistency import TargetPlaces, compare_targets
 from measure.targets.detection import CrossSearch, DiskSearch, cross_candidates, disk_candidates
 from measure.targets.identification import TargetOptions, TargetPrediction, measure_crosses, measure_disks
@@ -141,7 +141,7 @@ def across(normals: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class Field:
+class TargetField:
     """Targets that can be predicted.
 
     Attributes
@@ -158,7 +158,7 @@ class Field:
     normals: Mapping[str, Array]
     radius: float
 
-    def select(self, rows: Sequence[int]) -> "Field":
+    def select(self, rows: Sequence[int]) -> "TargetField":
         """A subset of the targets."""
         return replace(self, ids=tuple(self.ids[row] for row in rows), xyz=self.xyz[rows], sigmas=self.sigmas[rows])
 
@@ -178,7 +178,7 @@ def absent_targets(ids: Sequence[str], text: str, code: Code = Code.UNNAMED) -> 
     return tuple(MarkMeasurement(id, "target", None, None, Status.ABSENT, reason) for id in ids)
 
 
-def target_field(project: Project) -> Field:
+def target_field(project: Project) -> TargetField:
     """Field of the targets whose coordinates are known, at least approximately."""
     places = {id: (point.X, point.Y, point.Z) for id, point in project.object_points.items()}
     known = {id: [prior for prior in priors if prior is not None] for id, priors in places.items()}
@@ -188,10 +188,10 @@ def target_field(project: Project) -> Field:
         for what in ("value", "sigma")
     )
     normals = dict(project.given_points.normals) if project.given_points else {}
-    return Field(tuple(complete), xyz, sigmas, normals, project.target_radius)
+    return TargetField(tuple(complete), xyz, sigmas, normals, project.target_radius)
 
 
-def check_spacing(project: Project, field: Field) -> None:
+def check_spacing(project: Project, field: TargetField) -> None:
     """Raise InputError where most targets would cover one another."""
     if len(field.xyz) < 2:
         return
@@ -205,7 +205,7 @@ def check_spacing(project: Project, field: Field) -> None:
         )
 
 
-def target_candidates(scan: Scan, settings: TargetSettings, diameters_px: tuple[float, float]) -> list[Candidate]:
+def target_candidates(scan: Scan, settings: TargetSettings, diameters_px: tuple[float, float]) -> list[TargetCandidate]:
     """Candidates for the targets in the whole scan, the strongest first."""
     smallest = max(diameters_px[0], LEAST_DIAMETER_PX)
     sizes = (smallest, max(diameters_px[1], smallest))
@@ -225,7 +225,7 @@ def measure_single_targets(
 
 
 def checked_places(
-    marks: Sequence[MarkMeasurement], field: Field, model: ImageModel, scan: MeasuredScan
+    marks: Sequence[MarkMeasurement], field: TargetField, model: ImageModel, scan: MeasuredScan
 ) -> tuple[MarkMeasurement, ...]:
     """Compare the measured places with one another: improbable marks become weak, or are rejected.
 
@@ -257,7 +257,7 @@ def checked_places(
     return tuple(checked)
 
 
-def target_places(field: Field, model: ImageModel, scan: MeasuredScan) -> TargetPlaces:
+def target_places(field: TargetField, model: ImageModel, scan: MeasuredScan) -> TargetPlaces:
     """Predicted places of a field's points, with their derivatives with respect to the orientation and their
     covariances from the coordinates."""
 

@@ -12,10 +12,10 @@ from adjust.functional_model.lens import Lens
 from adjust.functional_model.projection import ImageModel
 from adjust.functional_model.transformation import Film
 from adjust.target_identification.naming import name_marks
-from measure.targets.block_search import Candidate
+from measure.targets.block_search import TargetCandidate
 from measure.targets.identification import TargetPrediction
 from pipeline.files.camera_file import CameraFile
-from pipeline.measuring.target_field import Field
+from pipeline.measuring.target_field import TargetField
 from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_comparator
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.types import Array, Indices, Mask
@@ -91,10 +91,10 @@ class NamedField:
     """
 
     model: ImageModel
-    candidates: Mapping[str, Candidate]
+    candidates: Mapping[str, TargetCandidate]
     gate_px: float
 
-    def predictions(self, field: Field, measured: MeasuredScan) -> tuple[TargetPrediction, ...]:
+    def predictions(self, field: TargetField, measured: MeasuredScan) -> tuple[TargetPrediction, ...]:
         """Predict the targets: identified ones at their candidates, others at the model's place plus the median offset
         of the neighbours."""
         predicted = field.predictions(self.model, measured, self.gate_px)
@@ -113,11 +113,11 @@ class NamedField:
 
 
 def name_field(
-    field: Field,
+    field: TargetField,
     model: ImageModel,
     camera: CameraFile,
     measured: MeasuredScan,
-    candidates: Sequence[Candidate],
+    candidates: Sequence[TargetCandidate],
     codes: Mapping[int, int] | None = None,
 ) -> NamedField | str:
     """Identify the candidates, which are sorted by strength.

@@ -20,7 +20,7 @@ from pipeline.files.target_table import TargetSettings
 from pipeline.measuring.coded_targets import CodedPoints, measure_coded_field, measure_sheet
 from pipeline.measuring.target_field import (
     LEAST_DIAMETER_PX,
-    Field,
+    TargetField,
     absent_targets,
     check_spacing,
     checked_places,
@@ -60,7 +60,7 @@ class SoughtTargets:
     """
 
     settings: TargetSettings
-    field: Field
+    field: TargetField
     coded: CodedPoints | None
     surveyed: bool
     unit: str

@@ -38,8 +38,8 @@ from pipeline.opencv_check.opencv_calibration import (
     NAMES,
     OPENCV_RADIAL,
     Freedom,
-    ImagePoints,
     OpenCvCalibration,
+    OpenCVPoints,
     calibrate,
     calibrate_fisheye,
     can_begin,
@@ -76,7 +76,7 @@ COUNTERPARTS: Mapping[str, Mapping[str, str]] = {
 # Parameters that OpenCV estimates only together.
 FREE_TOGETHER = (frozenset({"p1", "p2"}), frozenset({"s1", "s2", "s3", "s4"}), frozenset({"tau_x", "tau_y"}))
 Bytes = NDArray[np.uint8]
-Calibrate = Callable[[Sequence[ImagePoints]], OpenCvCalibration]
+Calibrate = Callable[[Sequence[OpenCVPoints]], OpenCvCalibration]
 
 HALF_WINDOW_PX = 11  # of cornerSubPix, as in OpenCV's calibration sample
 CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.0001)  # of the same sample
@@ -112,7 +112,7 @@ class BareProblem:
 
     network: Network
     approximations: Approximations
-    images: tuple[ImagePoints, ...]
+    images: tuple[OpenCVPoints, ...]
     freedom: Freedom
     sigma_mm: float
     sigma_spread: float
@@ -203,7 +203,7 @@ def find_points(picture: Bytes, board: BoardSpec) -> Array:
 
 
 def compare_corners(
-    images: Sequence[ImagePoints], pictures: BoardPictures, calibrate: Calibrate
+    images: Sequence[OpenCVPoints], pictures: BoardPictures, calibrate: Calibrate
 ) -> CornersCheck | None:
     """Calibrate the measured points and OpenCV's own points with OpenCV, using the points that both have.
 
@@ -220,7 +220,7 @@ def compare_corners(
         rows = np.flatnonzero(distance_mm < NEAREST * apart_mm)
         xyz, xy_mm = image.xyz[rows], image.xy_mm[rows]
         if can_begin(xyz):
-            both.append((ImagePoints(image.image, xyz, xy_mm), ImagePoints(image.image, xyz, own_mm[nearest[rows]])))
+            both.append((OpenCVPoints(image.image, xyz, xy_mm), OpenCVPoints(image.image, xyz, own_mm[nearest[rows]])))
     if len(both) < FEWEST_PICTURES:
         return None
     found = {image.image for image, _ in both}
@@ -568,7 +568,7 @@ def _freed(camera: Camera, distortion: Distortion, values: Mapping[str, float], 
     )
 
 
-def _image_points(adjustment: Adjustment, image: str) -> tuple[ImagePoints, Array, list[str]]:
+def _image_points(adjustment: Adjustment, image: str) -> tuple[OpenCVPoints, Array, list[str]]:
     """Observations of an image in the camera frame, their standard deviations (n,), and the names of the points."""
     observations = adjustment.network.observations
     weights = adjustment.weights if len(adjustment.weights) else np.ones(len(observations))
@@ -583,10 +583,10 @@ def _image_points(adjustment: Adjustment, image: str) -> tuple[ImagePoints, Arra
     gradient = model.camera_by_comparator(observations.xy_mm[rows])
     covariance = gradient @ observations.covariance_mm2[rows] @ gradient.swapaxes(1, 2)
     sigmas = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
-    return ImagePoints(image, xyz, model.camera_from_comparator(observations.xy_mm[rows])), sigmas, points
+    return OpenCVPoints(image, xyz, model.camera_from_comparator(observations.xy_mm[rows])), sigmas, points
 
 
-def _observations(shown: Mapping[str, tuple[ImagePoints, Array, list[str]]], sigma_mm: float) -> Observations:
+def _observations(shown: Mapping[str, tuple[OpenCVPoints, Array, list[str]]], sigma_mm: float) -> Observations:
     rows = [(name, point) for name, (_, _, points) in shown.items() for point in points]
     kinds: list[ObservationKind] = ["target"] * len(rows)
     coordinates = [image.xy_mm for image, _, _ in shown.values()]

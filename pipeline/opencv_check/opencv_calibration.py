@@ -114,7 +114,7 @@ def opencv_values(lens: Lens) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class ImagePoints:
+class OpenCVPoints:
     """One image for OpenCV: object points (n, 3) and their observations in the camera frame (n, 2), mm, y up."""
 
     image: str
@@ -150,7 +150,7 @@ def can_begin(xyz: Array) -> bool:
     return bool(len(xyz) >= FEWEST_DEEP or (extents[2] / extents[1]) ** 2 < FLAT)
 
 
-def calibrate(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> OpenCvCalibration:
+def calibrate(images: Sequence[OpenCVPoints], freedom: Freedom, start: Array) -> OpenCvCalibration:
     """OpenCV's least squares with initial values `start` (18,); parameters that are not in `freedom` are held.
 
     OpenCV's points are single precision. Object points are therefore reduced to their centroid and scaled to a common
@@ -193,7 +193,7 @@ def calibrate(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> 
     )
 
 
-def calibrate_fisheye(images: Sequence[ImagePoints], freedom: Freedom, start: Array) -> OpenCvCalibration:
+def calibrate_fisheye(images: Sequence[OpenCVPoints], freedom: Freedom, start: Array) -> OpenCvCalibration:
     """OpenCV's least squares of a fisheye with initial values `start` (9,); parameters that are not in `freedom` are
     held.
 
@@ -272,7 +272,7 @@ class _Pixels:
     size: tuple[int, int]
 
     @classmethod
-    def from_images(cls, images: Sequence[ImagePoints], start: Array) -> "_Pixels":
+    def from_images(cls, images: Sequence[OpenCVPoints], start: Array) -> "_Pixels":
         observed = np.concatenate([image.xy_mm for image in images])
         corners = np.array([np.minimum(observed.min(axis=0), start[2:4]), np.maximum(observed.max(axis=0), start[2:4])])
         mm = float((corners[1] - corners[0]).max()) / (PICTURE_PX - 1)

@@ -53,7 +53,7 @@ def read_scene(path: Path) -> SceneFile:
 
 
 @models.table_model
-class FilmTable(scene.Film):
+class FilmTable(scene.SceneFilm):
     """[film] of a scene: the film, and standard deviations of the random film transformation of each frame."""
 
     kind: Annotated[scene.FilmKind, Field(alias="transformation")] = "affine"
@@ -62,7 +62,7 @@ class FilmTable(scene.Film):
 
 
 @models.table_model
-class ScanTable(scene.Scanner):
+class ScanTable(scene.SceneScanner):
     """[scan] of a scene: the scanner, and standard deviations of the random position of each frame on it."""
 
     pitch_um: models.NumberOrPair
@@ -193,7 +193,7 @@ def _scene_camera(camera: CameraFile) -> scene.SceneCamera:
         frame_mm=camera.frame_mm or (0.0, 0.0),
         principal_distance_mm=camera.principal_distance_mm or 0.0,
         principal_point_mm=camera.principal_point_mm or (0.0, 0.0),
-        distortion=scene.Distortion(family, values, distortion.r0_mm, distortion.decentering),
+        distortion=scene.SceneDistortion(family, values, distortion.r0_mm, distortion.decentering),
         fiducials=tuple(fiducials),
     )
 

@@ -98,7 +98,7 @@ def write_project(scene_file: SceneFile, out_dir: Path) -> None:
         write_atomically(out_dir / TAKING_CAMERA, taking_camera_yaml(scene_file.scene, scene_file.scene.scanner.lens))
 
 
-def taking_camera_yaml(scene: scenes.Scene, lens: scenes.TakingLens) -> str:
+def taking_camera_yaml(scene: scenes.Scene, lens: scenes.SceneTakingLens) -> str:
     """The true lens of the camera that photographed the film, for cv2.FileStorage."""
     geometry = frame_geometry(scene, 0)
     size = geometry.width_px, geometry.height_px

@@ -17,7 +17,7 @@ from pipeline.report.data import ReportData
 from pipeline.report.numbers import fixed, significant
 from pipeline.report.parameters import camera_values, parameter_rows, term_rows
 from pipeline.report.vectors import grid_mm, longest_vector, padded_plane, strokes_and_dots
-from pipeline.results.adjustment_file import Covariance
+from pipeline.results.adjustment_file import ParameterCovariance
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, JoinedFrameRecord, ScannerRecord
 from pipeline.results.image_unit import ImageUnit
 from pipeline.types import Array
@@ -96,7 +96,12 @@ def _plane(
 
 
 def _lens_view(
-    name: str, camera: CameraRecord, covariance: Covariance, on: vectors.Plane | None, radius_mm: float, unit: ImageUnit
+    name: str,
+    camera: CameraRecord,
+    covariance: ParameterCovariance,
+    on: vectors.Plane | None,
+    radius_mm: float,
+    unit: ImageUnit,
 ) -> SimpleNamespace | None:
     """Distortion out to the corner of the frame or, if its size is unknown, of the observed area."""
     reach = camera.lens_known
@@ -130,7 +135,7 @@ def _uncertainty_maps(camera: CameraRecord, on: vectors.Plane, unit: str) -> Ite
 
 
 def scanner_view(
-    stored: AdjustmentRecord, covariance: Covariance | None, name: str, scanner: ScannerRecord
+    stored: AdjustmentRecord, covariance: ParameterCovariance | None, name: str, scanner: ScannerRecord
 ) -> SimpleNamespace:
     """Scanner of the adjustment for the template: its terms, and its bend as a field of vectors."""
     images, rows = sum(image.scanner == name for image in stored.images.values()), list(term_rows(scanner.terms))
@@ -171,7 +176,7 @@ def joined_view(name: str, frame: JoinedFrameRecord) -> SimpleNamespace:
     return view
 
 
-def bend_field(name: str, scanner: ScannerRecord, covariance: Covariance, xy_mm: Array) -> tuple[Array, Array]:
+def bend_field(name: str, scanner: ScannerRecord, covariance: ParameterCovariance, xy_mm: Array) -> tuple[Array, Array]:
     """Displacements (n, 2), µm, by the scanner at points (n, 2), mm, and their covariances (n, 2, 2)."""
     bend, values = scanner.bend()
     at = bend.displacement(values, xy_mm)

@@ -13,7 +13,7 @@ from measure.flags import Code, Reason, Status
 from measure.results import Covariance as MarkCovariance
 from measure.results import MarkMeasurement
 from pipeline.archive.verdicts import Verdict, frame_verdict, mark_verdict, scan_verdict
-from pipeline.results.adjustment_file import Covariance
+from pipeline.results.adjustment_file import ParameterCovariance
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.assessment_record import ResidualRecord
 from pipeline.results.comparator_file import ComparatorPoint
@@ -28,7 +28,7 @@ _SENTENCE = re.compile(r"(?<=[.:]) (?=[A-Z])")
 
 
 @dataclass(frozen=True)
-class Problem:
+class ReportedProblem:
     """Problem that needs a look. what: description; next_step: remedy, else the description after its first sentence.
 
     images, marks: those concerned, the report shows the first mark; section: of the report, with details.
@@ -76,7 +76,7 @@ class FrameTotals:
     marks: Mapping[str, Counter[str]]
     of_targets: Mapping[tuple[str, str], int]
     verdicts: Mapping[tuple[str, str], Counter[str]]
-    problems: tuple[Problem, ...]
+    problems: tuple[ReportedProblem, ...]
     places_px: Mapping[str, Array]
 
 
@@ -101,12 +101,12 @@ class ReportData:
     comparator: Sequence[ComparatorPoint] = ()
     measurement: Mapping[str, MeasuredScan] | None = None
     adjustment: AdjustmentRecord | None = None
-    covariance: Covariance | None = None
+    covariance: ParameterCovariance | None = None
     check: Check | None = None
     frame_mm: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     pitch_um: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     thumbnail: Callable[[str, str, str], Thumbnail | None] | None = None
-    problems: tuple[Problem, ...] = ()
+    problems: tuple[ReportedProblem, ...] = ()
     notes: tuple[str, ...] = ()
     made_from: Mapping[str, str] = field(default_factory=dict)
     unit: str = "m"
@@ -202,7 +202,7 @@ class Mark:
 
 
 @dataclass(frozen=True)
-class Frame:
+class ReportedFrame:
     """Image with its marks, fiducials first. scan: its measurement, None if not measured."""
 
     image: str
@@ -216,7 +216,7 @@ class Frame:
         return frame_verdict(marks, True, False, False) if self.scan is None else scan_verdict(self.scan, marks)
 
 
-def frames(data: ReportData) -> list[Frame]:
+def frames(data: ReportData) -> list[ReportedFrame]:
     """Frames of all images named in any of the files, sorted by name."""
     scans = current_scans(data)
     marks: dict[str, list[Mark]] = defaultdict(list)
@@ -224,7 +224,9 @@ def frames(data: ReportData) -> list[Frame]:
         marks[mark.image].append(mark)
     names = {*scans, *marks, *(data.adjustment.images if data.adjustment and not data.totals else {})}
     return [
-        Frame(name, tuple(sorted(marks[name], key=lambda mark: (not mark.is_fiducial, natural(mark.point)))), scan)
+        ReportedFrame(
+            name, tuple(sorted(marks[name], key=lambda mark: (not mark.is_fiducial, natural(mark.point)))), scan
+        )
         for name in sorted(names, key=natural)
         for scan in [scans.get(name)]
     ]

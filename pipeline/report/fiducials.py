@@ -10,7 +10,7 @@ from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.problem.parameter import Parameter
 from adjust.quality.fiducial_corrections import KEEPS_DISTANCES, corrections_to_given
 from pipeline.drawing import svg
-from pipeline.results.adjustment_file import Covariance
+from pipeline.results.adjustment_file import ParameterCovariance
 from pipeline.results.adjustment_record import AdjustmentRecord, FiducialRecord
 from pipeline.text.wording import listed
 from pipeline.types import Array
@@ -28,7 +28,7 @@ _MEASURED = Film("congruent", np.zeros(3), np.zeros(2))  # datum of fiducials wi
 
 
 @dataclass(frozen=True)
-class Distance:
+class MarkDistance:
     """Distance between two fiducials. change_um: estimated minus given; sigma_um includes the scale of the datum."""
 
     start: str
@@ -54,7 +54,7 @@ class Figure:
     given_mm: Array
     change_um: Array
     covariance_um2: Array
-    distances: tuple[Distance, ...]
+    distances: tuple[MarkDistance, ...]
     transformation: str
 
     @property
@@ -90,7 +90,7 @@ def correction_sentence(form: Figure, fiducials: Mapping[str, FiducialRecord], g
     )
 
 
-def figure(name: str, stored: AdjustmentRecord, covariance: Covariance) -> Figure | None:
+def figure(name: str, stored: AdjustmentRecord, covariance: ParameterCovariance) -> Figure | None:
     """Corrections of a camera's fiducials; None if the datum transformation absorbs all of them."""
     camera = stored.cameras[name]
     distance_sigmas = [row.sigma_mm for row in stored.fiducial_distances if row.camera == name]
@@ -105,7 +105,7 @@ def figure(name: str, stored: AdjustmentRecord, covariance: Covariance) -> Figur
 def figure_of_films(
     name: str,
     fiducials: Mapping[str, FiducialRecord],
-    covariance: Covariance,
+    covariance: ParameterCovariance,
     films: Mapping[str, Film],
     otherwise: Film = _CALIBRATED,
 ) -> Figure | None:
@@ -139,7 +139,9 @@ def figure_of_films(
     return Figure(tuple(known), given, *changes, distances, left.transformation)
 
 
-def _distances(ids: tuple[str, ...], places_mm: Array, given_mm: Array, covariance_mm2: Array) -> tuple[Distance, ...]:
+def _distances(
+    ids: tuple[str, ...], places_mm: Array, given_mm: Array, covariance_mm2: Array
+) -> tuple[MarkDistance, ...]:
     """Distance from each mark to the farthest one. covariance_mm2: (2n, 2n) of the coordinates, datum included."""
     apart = np.linalg.norm(given_mm[:, None] - given_mm, axis=2)
     pairs = np.sort(np.stack([np.arange(len(apart)), apart.argmax(axis=1)], axis=1), axis=1)
@@ -151,7 +153,7 @@ def _distances(ids: tuple[str, ...], places_mm: Array, given_mm: Array, covarian
         by_places[j], by_places[i] = vector_mm / length_mm, -vector_mm / length_mm
         variance_mm2 = max(float(by_places.ravel() @ covariance_mm2 @ by_places.ravel()), 0.0)
         change_um = 1e3 * (length_mm - float(apart[i, j]))
-        found.append(Distance(ids[i], ids[j], length_mm, change_um, 1e3 * float(np.sqrt(variance_mm2))))
+        found.append(MarkDistance(ids[i], ids[j], length_mm, change_um, 1e3 * float(np.sqrt(variance_mm2))))
     return tuple(found)
 
 

@@ -12,7 +12,7 @@ from scipy.special import bdtrik, chdtrc
 from measure.flags import Code
 from pipeline.archive.verdicts import NEXT_STEP
 from pipeline.drawing import svg
-from pipeline.report.data import Frame, Mark, Problem
+from pipeline.report.data import Mark, ReportedFrame, ReportedProblem
 from pipeline.report.numbers import fixed
 from pipeline.text.wording import LISTED, capitalised, counted, drop_file_name, listed
 from pipeline.types import Array
@@ -35,11 +35,11 @@ _ONE_ANSWER = (
 class AlikeProblems:
     """Problems that differ only in numbers: the first, the images of all, and whether the numbers differ."""
 
-    first: Problem
+    first: ReportedProblem
     images: list[str]
     differ: bool = False
 
-    def together(self) -> Problem:
+    def together(self) -> ReportedProblem:
         """The first problem, with the names of all images."""
         numbers = f" (numbers of {self.images[0]})" if self.differ else ""
         return replace(self.first, what=f"{listed(self.images)}{numbers}: {self.first.what}", images=tuple(self.images))
@@ -70,7 +70,7 @@ class FractionTest:
         return self.probability is not None and self.probability < LEAST_PROBABILITY and self.bias_px > LEAST_BIAS_PX
 
 
-def places_px(shots: Iterable[Frame]) -> dict[str, Array]:
+def places_px(shots: Iterable[ReportedFrame]) -> dict[str, Array]:
     """Distinct columns and rows (n,) of the observed marks.
 
     Equal positions count once: a mark that recurs in every frame, or a grid line parallel to the pixels, has only one
@@ -79,7 +79,7 @@ def places_px(shots: Iterable[Frame]) -> dict[str, Array]:
     return places_apart([center for frame in shots for center in centers_px(frame)])
 
 
-def centers_px(frame: Frame) -> Iterator[Array]:
+def centers_px(frame: ReportedFrame) -> Iterator[Array]:
     """Yield the centres (2,) of the observed marks of a frame."""
     for mark in frame.marks:
         if mark.status.is_observation and mark.center_px is not None:
@@ -144,7 +144,7 @@ def fraction_plot(axis: str, test: FractionTest) -> Markup:
     return svg.picture(axes.width, axes.height, title, *bars, band, axes.grid(label, "marks"))
 
 
-def single_frame_problems(frame: Frame) -> Iterator[Problem]:
+def single_frame_problems(frame: ReportedFrame) -> Iterator[ReportedProblem]:
     """Yield the problems of one frame, an undetermined scan orientation (pose) first."""
     yield from _assumed_pose(frame)
     yield from _other_problems(frame)
@@ -155,7 +155,7 @@ def masked_text(sentence: str) -> str:
     return _NUMBER.sub("#", sentence)
 
 
-def frame_problems(shots: list[Frame]) -> Iterator[Problem]:
+def frame_problems(shots: list[ReportedFrame]) -> Iterator[ReportedProblem]:
     """Yield the problems of all frames, scan orientations (poses) first. Problems that differ only in numbers are
     merged."""
     for evidence in (_assumed_pose, _other_problems):
@@ -165,7 +165,7 @@ def frame_problems(shots: list[Frame]) -> Iterator[Problem]:
         yield from (each.together() for each in gathered.values())
 
 
-def gather(gathered: Gathered, image: str, problems: Iterable[Problem]) -> None:
+def gather(gathered: Gathered, image: str, problems: Iterable[ReportedProblem]) -> None:
     """Add the problems of an image, grouped with those that differ only in numbers."""
     for problem in problems:
         alike = masked_text(problem.what), problem.next_step
@@ -174,47 +174,47 @@ def gather(gathered: Gathered, image: str, problems: Iterable[Problem]) -> None:
         known.differ |= problem.what != known.first.what
 
 
-def _assumed_pose(frame: Frame) -> Iterator[Problem]:
+def _assumed_pose(frame: ReportedFrame) -> Iterator[ReportedProblem]:
     pose = frame.scan.frame.pose if frame.scan else None
     if not pose or pose.decided:
         return
     if pose.roll:
-        yield Problem(f"pose assumed: {pose.roll}.", _ONE_ANSWER)
+        yield ReportedProblem(f"pose assumed: {pose.roll}.", _ONE_ANSWER)
     else:
-        yield Problem(
+        yield ReportedProblem(
             f"pose assumed ({pose.name}). {' '.join(map(capitalised, pose.evidence))}",
             'If the scan was laid on the scanner otherwise, set scan_orientation = "90", "180", "270" or with "m" '
             "under [measure].",
         )
 
 
-def _other_problems(frame: Frame) -> Iterator[Problem]:
+def _other_problems(frame: ReportedFrame) -> Iterator[ReportedProblem]:
     """Yield problems but for an assumed pose: at least one where the verdict on the scan asks for a look."""
     problems = list(_measurement_problems(frame))
     if problems or any(_assumed_pose(frame)) or frame.scan is None or not frame.verdict.needs_review:
         yield from problems
     else:
-        yield Problem(frame.verdict.meaning, NEXT_STEP[frame.verdict])
+        yield ReportedProblem(frame.verdict.meaning, NEXT_STEP[frame.verdict])
 
 
-def _measurement_problems(frame: Frame) -> Iterator[Problem]:
+def _measurement_problems(frame: ReportedFrame) -> Iterator[ReportedProblem]:
     pose, problems = (frame.scan.frame.pose, frame.scan.frame.problems) if frame.scan else (None, ())
     evidence = pose.evidence if pose and not pose.decided else ()
     for problem in problems:
         if problem not in evidence:
-            yield Problem(drop_file_name(problem, frame.scan.scan) if frame.scan else problem)
+            yield ReportedProblem(drop_file_name(problem, frame.scan.scan) if frame.scan else problem)
     doubtful = [mark for mark in frame.marks if mark.needs_review]
     lost, weak = ([mark for mark in doubtful if mark.status.is_observation is is_used] for is_used in (False, True))
     found = sum(mark.is_fiducial and mark.status.is_observation for mark in frame.marks)
     if lost and (found or pose):  # otherwise the frame was not found, which is a problem of its own
-        yield Problem(
+        yield ReportedProblem(
             f"{counted(len(lost), 'fiducial mark')} not measured, {found} measured. Reasons: {_reasons(lost)}.",
             "Settle them with `reseau review`."
             + (" The frame is used; its film transformation is less precise." if found else ""),
             marks=tuple((frame.image, mark.kind, mark.point) for mark in lost),
         )
     if weak:
-        yield Problem(
+        yield ReportedProblem(
             f"{counted(len(weak), 'weak fiducial mark')}. Reasons: {_reasons(weak)}.",
             "Settle them with `reseau review`, or leave them: their standard deviations allow for it.",
             marks=tuple((frame.image, mark.kind, mark.point) for mark in weak),
@@ -223,7 +223,7 @@ def _measurement_problems(frame: Frame) -> Iterator[Problem]:
     is_lost = frame.scan is not None and frame.scan.failure is not None
     is_explained = any({Code.COPY, Code.NO_BOARD} & {*problem.codes} for problem in problems)
     if targets and not is_lost and not is_explained and not any(mark.status.is_observation for mark in targets):
-        yield Problem(
+        yield ReportedProblem(
             f"none of its {len(targets)} targets was measured.",
             "Look at their reasons in comparator.csv: a wrong orientation, scan orientation or diameter misses all.",
         )
@@ -242,13 +242,13 @@ def _reasons(lost: list[Mark]) -> str:
     return "; ".join(sentences)
 
 
-def pixel_locking(places_px: Mapping[str, Array]) -> Iterator[Problem]:
+def pixel_locking(places_px: Mapping[str, Array]) -> Iterator[ReportedProblem]:
     """Yield problems of pixel locking. places_px: distinct positions of the marks by axis, see
     `frame_problems.places_px`."""
     for axis, positions in places_px.items():
         test = fraction_test(positions)
         if test.is_locked:
-            yield Problem(
+            yield ReportedProblem(
                 f"The {axis} positions of the marks prefer parts of a pixel (pixel locking): they are biased by up to "
                 f"{fixed(test.bias_px)} px.",
                 "Scan with a finer pitch or in 16 bit.",

@@ -14,7 +14,7 @@ from measure.flags import Status
 from measure.geometry import UP_FROM_CAMERA
 from pipeline.drawing import svg
 from pipeline.report import vectors
-from pipeline.report.data import Frame, Mark, ReportData
+from pipeline.report.data import Mark, ReportData, ReportedFrame
 from pipeline.report.numbers import fixed, fixed_list
 from pipeline.report.vectors import LEAST_UM
 from pipeline.report.verdict import suspect_rows
@@ -39,7 +39,7 @@ LONGEST_VECTOR_PX = 42.0
 _LEAST_PART = 0.1  # share of the variance above which a cause is listed
 
 
-def shown_marks(shots: list[Frame]) -> dict[str, list[Mark]]:
+def shown_marks(shots: list[ReportedFrame]) -> dict[str, list[Mark]]:
     """Select the marks of each frame that get a picture: all fiducials, and all targets or the worst of them."""
     targets = sum(not mark.is_fiducial for frame in shots for mark in frame.marks)
     most = targets if targets <= TARGETS else max(LEAST_TARGETS, TARGETS // len(shots))
@@ -56,7 +56,7 @@ def _badness(mark: Mark) -> tuple[bool, bool, float]:
     return (mark.status == "rejected", mark.status in ("weak", "predicted"), abs(mark.w) if mark.w is not None else 0.0)
 
 
-def arrow_scale(shots: list[Frame]) -> float:
+def arrow_scale(shots: list[ReportedFrame]) -> float:
     """Scale of residual arrows on thumbnails, page pixels per µm: a round number at which the longest arrow fits."""
     lengths = [float(np.hypot(*mark.residual.v_um)) for frame in shots for mark in frame.marks if mark.residual]
     return svg.round_step(ARROW_PX / max(*lengths, LEAST_UM)) if lengths else 1.0
@@ -168,7 +168,7 @@ class FrameView:
     """
 
     id: str
-    frame: Frame
+    frame: ReportedFrame
     unit: ImageUnit
     fiducials: str
     targets: str
@@ -186,7 +186,7 @@ class FrameView:
         return is_lost, math.hypot(*(self.rms or (0.0,))), sum(mark.needs_review for mark in self.frame.marks)
 
 
-def frame_views(data: ReportData, shots: list[Frame], every_mark: bool = False) -> list[FrameView]:
+def frame_views(data: ReportData, shots: list[ReportedFrame], every_mark: bool = False) -> list[FrameView]:
     """Views of all frames, the worst first, drawn to common scales. every_mark: show all marks, whatever their
     number."""
     shown = {frame.image: list(frame.marks) for frame in shots} if every_mark else shown_marks(shots)

@@ -21,7 +21,7 @@ from adjust.quality.lens_uncertainty import (
 )
 from pipeline.drawing import svg
 from pipeline.report.vectors import Plane, grid_mm, longest_vector, strokes_and_dots
-from pipeline.results.adjustment_file import Covariance
+from pipeline.results.adjustment_file import ParameterCovariance
 from pipeline.results.adjustment_record import CameraRecord
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.types import Array
@@ -78,7 +78,7 @@ class LensMap:
     largest_um: tuple[float, float]
 
 
-def lens(name: str, camera: CameraRecord, covariance: Covariance | None = None) -> Lens:
+def lens(name: str, camera: CameraRecord, covariance: ParameterCovariance | None = None) -> Lens:
     """Lens of a camera in adjustment.json, with its covariance if given."""
     known = camera.lens()
     if covariance is None:

@@ -22,7 +22,7 @@ from pipeline.files.project_file import Project
 from pipeline.provenance import hash_file
 from pipeline.publishing import outside_note
 from pipeline.report import frame_problems
-from pipeline.report.data import Frame, FrameTotals, Problem, ReportData, frames
+from pipeline.report.data import FrameTotals, ReportData, ReportedFrame, ReportedProblem, frames
 from pipeline.report.frame_problems import centers_px
 from pipeline.report.verdict import suspect_rows
 from pipeline.results.adjustment_file import read_adjustment, read_covariance
@@ -61,11 +61,13 @@ class _FrameCounts:
         problems = [each.together() for each in ordered[:_MOST_PROBLEMS]]
         if rest := sum(len(each.images) for each in ordered[_MOST_PROBLEMS:]):
             what = f"{counted(rest, 'more problem')} of frames, all different."
-            problems.append(Problem(what, "`reseau status --csv` has them."))
+            problems.append(ReportedProblem(what, "`reseau status --csv` has them."))
         places = frame_problems.places_apart(np.array(self.centers_px))
         return FrameTotals(self.marks, self.of_targets, self.verdicts, tuple(problems), places)
 
-    def add(self, frame: Frame, kind: tuple[str, str], verdict: Verdict, problems: Iterable[Problem]) -> None:
+    def add(
+        self, frame: ReportedFrame, kind: tuple[str, str], verdict: Verdict, problems: Iterable[ReportedProblem]
+    ) -> None:
         self.verdicts[kind][verdict] += 1
         self.marks[frame.image] = Counter(str(mark.status) for mark in frame.marks)
         self.of_targets.update((mark.kind, mark.status) for mark in frame.marks if not mark.is_fiducial)
@@ -153,7 +155,7 @@ def _one_by_one(data: ReportData, scans: Iterable[MeasuredScan]) -> Iterator[Rep
         yield frame_data(image, None)
 
 
-def frame_counts(data: ReportData, shots: Sequence[Frame]) -> Counter[Verdict]:
+def frame_counts(data: ReportData, shots: Sequence[ReportedFrame]) -> Counter[Verdict]:
     """Numbers of all frames by verdict, for the report and the terminal. shots: the frames shown."""
     total = Counter[Verdict]()
     for row in verdict_counts(data, shots).values():
@@ -161,7 +163,7 @@ def frame_counts(data: ReportData, shots: Sequence[Frame]) -> Counter[Verdict]:
     return total
 
 
-def verdict_counts(data: ReportData, shots: Sequence[Frame]) -> Mapping[tuple[str, str], Mapping[str, int]]:
+def verdict_counts(data: ReportData, shots: Sequence[ReportedFrame]) -> Mapping[tuple[str, str], Mapping[str, int]]:
     """Numbers of frames by (camera, kind of file) and verdict."""
     if data.totals is not None:
         return data.totals.verdicts
@@ -211,11 +213,11 @@ def measured_data(
         return replace(data, notes=(*data.notes, f"{comparator.name} was given: {path.name} says nothing of it."))
     if made is None:
         what = f"{path.name} is of other marks than {project.comparator.name}: it is not shown."
-        return _add_problems(data, Problem(what, "Run `reseau measure`."))
+        return _add_problems(data, ReportedProblem(what, "Run `reseau measure`."))
     many = rows is not None or (most_frames is not None and _frame_count(data) > most_frames)
     scans = {} if many else {scan.frame.image: scan for scan in measured_scans(path, digest)}
     data = replace(data, measurement=scans, made_from={**data.made_from, path.name: digest})
-    unlike: list[Problem] = []
+    unlike: list[ReportedProblem] = []
     if project.scans:
         now = provenance.measured_from(project)
         unlike = list(_unlike(made, now))
@@ -224,11 +226,11 @@ def measured_data(
             note = f"The marks were looked for with other {places} than there are now; `reseau measure` looks again."
             data = replace(data, notes=(*data.notes, note))
     damaged = [
-        Problem(scan.failure.sentence, "Nothing else of this image is shown as measured until then.")
+        ReportedProblem(scan.failure.sentence, "Nothing else of this image is shown as measured until then.")
         for scan in scans.values()
         if scan.failure is not None and scan.failure.code is FailureCode.DAMAGED
     ]
-    idle = [Problem(f"{project.decisions_path.name}, {line}", "It does not count.") for line in lines]
+    idle = [ReportedProblem(f"{project.decisions_path.name}, {line}", "It does not count.") for line in lines]
     return _add_problems(data, *damaged, *idle, *unlike)
 
 
@@ -303,7 +305,7 @@ def adjusted_data(project: Project, at: At, most_frames: int | None = None) -> R
     elif covariance.adjustment != fingerprint:
         not_shown = f"adjustment.npz goes with another {path.name}: both are not shown."
     if not_shown:
-        return _add_problems(data, Problem(not_shown, "Run `reseau adjust`."))
+        return _add_problems(data, ReportedProblem(not_shown, "Run `reseau adjust`."))
     made_from = {**data.made_from, path.name: fingerprint}
     data = replace(data, adjustment=adjustment, covariance=covariance, made_from=made_from)
     check_path = at(project.check_path)
@@ -313,11 +315,11 @@ def adjusted_data(project: Project, at: At, most_frames: int | None = None) -> R
         return data
     if check.made_from != {path.name: fingerprint}:
         what = f"{check_path.name} is of another adjustment: it is not shown."
-        return _add_problems(data, Problem(what, "Run `reseau check`."))
+        return _add_problems(data, ReportedProblem(what, "Run `reseau check`."))
     return replace(data, check=check, made_from={**data.made_from, check_path.name: hash_file(check_path)})
 
 
-def _unlike(made: Mapping[str, str], now: Mapping[str, str]) -> Iterator[Problem]:
+def _unlike(made: Mapping[str, str], now: Mapping[str, str]) -> Iterator[ReportedProblem]:
     """Yield problems of measurements that do not match the current scans, decisions or settings."""
     others = provenance.differing(made, now)
     scans = [name.removeprefix(provenance.SCAN) for name in others if name.startswith(provenance.SCAN)]
@@ -330,20 +332,22 @@ def _unlike(made: Mapping[str, str], now: Mapping[str, str]) -> Iterator[Problem
     }
     for what, names in kinds.items():
         if names:
-            yield Problem(f"{what}: {listed(names)}.", "Run `reseau measure`; what is shown is of the earlier scans.")
+            yield ReportedProblem(
+                f"{what}: {listed(names)}.", "Run `reseau measure`; what is shown is of the earlier scans."
+            )
     if provenance.DECISIONS in others:
-        yield Problem(
+        yield ReportedProblem(
             "Decisions were made, or taken back, since the cross-scan checks.",
             "Run `reseau measure`, which takes them in; what is shown is without them.",
         )
     changed = ["project" if name == provenance.SETTINGS else name for name in others if name in made and name in now]
     changed = [name for name in changed if name == "project" or name.startswith(provenance.CAMERA)]
     if changed:
-        yield Problem(
+        yield ReportedProblem(
             f"The marks were measured with other settings than there are now of {listed(changed)}.",
             "Run `reseau measure`; what is shown was measured with the earlier ones.",
         )
 
 
-def _add_problems(data: ReportData, *problems: Problem) -> ReportData:
+def _add_problems(data: ReportData, *problems: ReportedProblem) -> ReportData:
     return replace(data, problems=(*data.problems, *problems))

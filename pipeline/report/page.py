@@ -17,7 +17,7 @@ from pipeline.archive.verdicts import scan_counts
 from pipeline.drawing import svg
 from pipeline.report import frame_problems
 from pipeline.report.camera_views import camera_view, joined_view, scanner_view
-from pipeline.report.data import Frame, Problem, ReportData, frames
+from pipeline.report.data import ReportData, ReportedFrame, ReportedProblem, frames
 from pipeline.report.fiducials import correction_sentence, figure_plot
 from pipeline.report.frame_views import FrameView, arrow_scale, frame_views
 from pipeline.report.load import BEST_FIRST, frame_counts, verdict_counts
@@ -137,7 +137,7 @@ def _common(data: ReportData) -> dict[str, object]:
     }
 
 
-def _frame_context(data: ReportData, shots: list[Frame], every_mark: bool = False) -> dict[str, Any]:
+def _frame_context(data: ReportData, shots: list[ReportedFrame], every_mark: bool = False) -> dict[str, Any]:
     """Frames and their marks for the templates."""
     views = frame_views(data, shots, every_mark)
     cards = [card for view in views for card in view.cards if card.needs_review]  # of the worst frame first
@@ -164,7 +164,7 @@ def _frame_context(data: ReportData, shots: list[Frame], every_mark: bool = Fals
     }
 
 
-def _totals(data: ReportData, shots: Sequence[Frame]) -> dict[str, object]:
+def _totals(data: ReportData, shots: Sequence[ReportedFrame]) -> dict[str, object]:
     """Numbers of all frames, of a report that does not show all or of which only fiducials were adjusted."""
     counts, total = verdict_counts(data, shots), frame_counts(data, shots)
     return {
@@ -176,7 +176,9 @@ def _totals(data: ReportData, shots: Sequence[Frame]) -> dict[str, object]:
     }
 
 
-def _links_and_picture(problem: Problem, views: Sequence[FrameView]) -> tuple[list[tuple[str, str]], Markup | None]:
+def _links_and_picture(
+    problem: ReportedProblem, views: Sequence[FrameView]
+) -> tuple[list[tuple[str, str]], Markup | None]:
     """Links of a problem, as text and target, and the picture of its first mark that has one."""
     known = {view.frame.image: view for view in views}
     images = dict.fromkeys((*problem.images, *(image for image, *_ in problem.marks)))

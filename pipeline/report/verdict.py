@@ -11,7 +11,7 @@ from scipy.special import chdtri, ndtri
 
 from adjust.problem.parameter import Parameter, description, parameter_from_text
 from measure.flags import Status
-from pipeline.report.data import Frame, Problem, ReportData, frames
+from pipeline.report.data import ReportData, ReportedFrame, ReportedProblem, frames
 from pipeline.report.frame_problems import frame_problems, pixel_locking, places_px
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.report.parameters import camera_values, spoken_name
@@ -69,7 +69,7 @@ class ReportVerdict:
 
     level: Level
     sentence: str
-    problems: tuple[Problem, ...]
+    problems: tuple[ReportedProblem, ...]
     notes: tuple[str, ...]
 
     @property
@@ -86,14 +86,14 @@ def judge(data: ReportData) -> ReportVerdict:
     return ReportVerdict(level, _sentence(data, shots, level, len(problems)), problems, tuple(_notes(data, shots)))
 
 
-def problems_by_test(data: ReportData, shots: list[Frame]) -> dict[str, Iterable[Problem]]:
+def problems_by_test(data: ReportData, shots: list[ReportedFrame]) -> dict[str, Iterable[ReportedProblem]]:
     """What leads to exit code 1, by the names of the tests in docs/reference/results.md."""
     stored, check, totals, solved = data.adjustment, data.check, data.totals, _solved(data)
-    unchecked = Problem(
+    unchecked = ReportedProblem(
         "Nothing checks the result: there are as many unknowns as observations.",
         "Add points or frames; until then no standard deviation here has been confirmed by the data.",
     )
-    differs = Problem(
+    differs = ReportedProblem(
         f"OpenCV's calibration of the same observations differs. {check.reason if check else ''}",
         "See the table of the check: a parameter that differs by many standard deviations points to the cause.",
         section="check",
@@ -103,7 +103,7 @@ def problems_by_test(data: ReportData, shots: list[Frame]) -> dict[str, Iterable
         "made from": data.problems,
         "frames": totals.problems if totals else frame_problems(shots),
         "pixel locking": pixel_locking(totals.places_px if totals else places_px(shots)),
-        "warnings": map(Problem, stored.warnings if stored else ()),
+        "warnings": map(ReportedProblem, stored.warnings if stored else ()),
         "σ₀": _too_large(solved) if solved and solved.has_sigma0 else (),
         "redundancy": [unchecked] if solved and solved.redundancy <= 0 else (),
         "reach of the lens": _lens_problems(data, solved) if solved else (),
@@ -130,13 +130,13 @@ def suspect_rows(adjustment: AdjustmentRecord) -> frozenset[assessment_record.Re
     return frozenset(row for row in adjustment.residuals if (row.kind, row.image, row.point) in names)
 
 
-def _no_solution(adjustment: AdjustmentRecord) -> Iterator[Problem]:
+def _no_solution(adjustment: AdjustmentRecord) -> Iterator[ReportedProblem]:
     for null in adjustment.singular:
         together = description(parameter_from_text(each.text, adjustment.cameras) for each in null.parameters)
-        yield Problem(f"{null.cause} The observations do not see it (together move {together}).", null.remedy)
+        yield ReportedProblem(f"{null.cause} The observations do not see it (together move {together}).", null.remedy)
     if not adjustment.converged and not adjustment.singular:
         is_practically = any(warning.startswith("Practically singular") for warning in adjustment.warnings)
-        yield Problem(
+        yield ReportedProblem(
             f"The iteration did not come to rest ({adjustment.termination}, {adjustment.iterations} iterations).",
             "The images hardly determine what is named below as practically singular: add what is advised there, or "
             "fix it."
@@ -147,7 +147,7 @@ def _no_solution(adjustment: AdjustmentRecord) -> Iterator[Problem]:
         )
 
 
-def _suspects(adjustment: AdjustmentRecord) -> Iterator[Problem]:
+def _suspects(adjustment: AdjustmentRecord) -> Iterator[ReportedProblem]:
     kept = [row for row in adjustment.suspects if not row.removed]
     given, marks = ([row for row in kept if (row.group in GIVEN) is is_given] for is_given in (True, False))
     remedy = (
@@ -176,7 +176,7 @@ def _suspects(adjustment: AdjustmentRecord) -> Iterator[Problem]:
         if rows:
             of_frames = tuple((row.owner, row.group, row.point) for row in rows if row.group in ON_FRAMES)
             what = f"{heading}: {listed(list(map(_suspect, rows)))}."
-            yield Problem(what, what_to_do, marks=of_frames, section="reliability")
+            yield ReportedProblem(what, what_to_do, marks=of_frames, section="reliability")
 
 
 def _suspect(row: assessment_record.SuspectRecord) -> str:
@@ -184,18 +184,18 @@ def _suspect(row: assessment_record.SuspectRecord) -> str:
     return f"{row.name} (w = {fixed(row.w, 1)}{alike})"
 
 
-def _further_problems(adjustment: AdjustmentRecord) -> Iterator[Problem]:
+def _further_problems(adjustment: AdjustmentRecord) -> Iterator[ReportedProblem]:
     """Yield problems of earlier calibrations, distances and antennas that the images contradict."""
     heading, remedy = CALIBRATION
     tests = [test for test in adjustment.calibration_tests if test.p < CONTRADICTED]
-    yield from (Problem(f"{heading}: {contradiction(test, adjustment.cameras)}.", remedy) for test in tests)
+    yield from (ReportedProblem(f"{heading}: {contradiction(test, adjustment.cameras)}.", remedy) for test in tests)
     if not tests and (bad := _outlying(adjustment, adjustment.calibrations)):
         names = [spoken_name(row.name, adjustment.cameras) for row in bad]
-        yield Problem(f"{heading}: {_named(bad, names)}.", remedy)
+        yield ReportedProblem(f"{heading}: {_named(bad, names)}.", remedy)
     for group, one, many, heading, remedy, section in FURTHER:
         if bad := _outlying(adjustment, getattr(adjustment, group)):
             what = f"{counted(len(bad), one, many)} {heading}: {_named(bad, [row.name for row in bad])}."
-            yield Problem(what, remedy, section=section)
+            yield ReportedProblem(what, remedy, section=section)
 
 
 def _named(rows: Sequence[Observed], names: Sequence[str]) -> str:
@@ -217,10 +217,10 @@ def _outlying(adjustment: AdjustmentRecord, rows: Sequence[Observed]) -> list[Ob
     return [row for row in rows if abs(row.w) > limit]
 
 
-def _too_large(adjustment: AdjustmentRecord) -> Iterator[Problem]:
+def _too_large(adjustment: AdjustmentRecord) -> Iterator[ReportedProblem]:
     """Yield the problem of a significantly large sigma0, with explanations if there are any."""
     _, high = sigma0_bounds(adjustment.variance_factor.redundancy)
-    explained = [Problem(each.cause, each.remedy) for each in adjustment.explanations]
+    explained = [ReportedProblem(each.cause, each.remedy) for each in adjustment.explanations]
     if adjustment.sigma0 <= high:
         yield from explained
         return
@@ -233,7 +233,7 @@ def _too_large(adjustment: AdjustmentRecord) -> Iterator[Problem]:
         return
     is_calibrated = any(camera.is_calibrated for camera in adjustment.cameras.values())
     model = "add distortion parameters" if is_calibrated else "choose a richer film transformation"
-    yield Problem(
+    yield ReportedProblem(
         f"{size} ({_group_sigmas(adjustment)}).",
         f"Reject gross errors first; then {model}, or state film_sigma_um. All σ are already multiplied by σ₀.",
         section="reliability",
@@ -251,13 +251,13 @@ def _sigma0_and(side: str, bound: float, sigma0: float) -> str:
     return f"σ₀ = {sigma0:.{digits}f} is {side} {bound:.{digits}f}"
 
 
-def _lens_problems(data: ReportData, solved: AdjustmentRecord) -> Iterator[Problem]:
+def _lens_problems(data: ReportData, solved: AdjustmentRecord) -> Iterator[ReportedProblem]:
     """Yield problems of lenses observed out to less than half the corner radius, and of principal distances that the
     images alone have to determine and hardly do."""
     for name, camera in solved.cameras.items():
         c = camera.principal_distance_mm
         if not (c.given and math.isfinite(c.given.sigma)) and c.sigma > LOOSE * c.value:
-            yield Problem(
+            yield ReportedProblem(
                 f"The principal distance of {name} is known to {100.0 * c.sigma / c.value:.1g} % only: the images "
                 "hardly separate it from how far away they were taken.",
                 "Tilt the board, or the camera, by 20 to 45 degrees in different directions.",
@@ -267,7 +267,7 @@ def _lens_problems(data: ReportData, solved: AdjustmentRecord) -> Iterator[Probl
     remedy = "Observe targets out to the corners of the picture, or use the lens within that radius only."
     for _, sentence, share in lens_sentences(data):
         if share < LEAST_SHARE:
-            yield Problem(sentence, remedy, section="coverage")
+            yield ReportedProblem(sentence, remedy, section="coverage")
 
 
 def lens_sentences(data: ReportData) -> Iterator[tuple[str, str, float]]:
@@ -297,7 +297,7 @@ def _solved(data: ReportData) -> AdjustmentRecord | None:
     return data.adjustment if data.adjustment and not any(_no_solution(data.adjustment)) else None
 
 
-def _notes(data: ReportData, shots: list[Frame]) -> Iterator[str]:
+def _notes(data: ReportData, shots: list[ReportedFrame]) -> Iterator[str]:
     """Yield remarks that need no action."""
     yield from data.notes
     if not data.comparator and not data.measurement and not data.totals:
@@ -382,7 +382,7 @@ def _weight_notes(adjustment: AdjustmentRecord) -> Iterator[str]:
         )
 
 
-def _sentence(data: ReportData, shots: list[Frame], level: Level, problems: int) -> str:
+def _sentence(data: ReportData, shots: list[ReportedFrame], level: Level, problems: int) -> str:
     marks = _observed(data, shots)
     found = f"{counted(marks, 'mark')} in {counted(len(data.totals.marks if data.totals else shots), 'frame')}"
     ending = f", but {counted(problems, 'thing needs', 'things need')} a look." if level == "look" else "."
@@ -408,7 +408,7 @@ def _sentence(data: ReportData, shots: list[Frame], level: Level, problems: int)
     return f"Calibrated from {found}: {'; '.join(constants)}{ending}"
 
 
-def _observed(data: ReportData, shots: list[Frame]) -> int:
+def _observed(data: ReportData, shots: list[ReportedFrame]) -> int:
     """Number of observed marks; from the adjustment if there is no comparator file."""
     if data.totals:
         return sum(count[status] for count in data.totals.marks.values() for status in (Status.MEASURED, Status.WEAK))

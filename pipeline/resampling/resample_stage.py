@@ -124,7 +124,7 @@ class Tile(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class OpenPart:
     """An open partial scan, with its chain to the frame. inner: which of its edges (left, right, top, bottom) lie in
     another scan; smoothing_px: see `interpolated`."""
 
@@ -432,7 +432,7 @@ def _resampled(task: ResampleTask) -> Resampled:
             pixels, _ = chain.scan_from_frame(row_of_tiles * task.pitch_mm)
             rows = int(np.ptp(pixels[:, 1])) + 2 * MARGIN_PX
             source = opened.enter_context(open_source(scan, rows, task.target.parent))
-            parts.append(Part(source, chain, _smoothing_px(chain, canvas)))
+            parts.append(OpenPart(source, chain, _smoothing_px(chain, canvas)))
         parts = find_inner_edges(parts)
         described: dict[str, object] = {"image": task.image, "camera": task.camera, "pose": task.pose}
         described |= {"lens": task.scans[0].chain.lens is not None, "fingerprint": task.fingerprint}
@@ -523,7 +523,7 @@ def spline_samples(
     return np.clip(values, 0, highest).astype(dtype), clamped
 
 
-def find_inner_edges(parts: Sequence[Part]) -> list[Part]:
+def find_inner_edges(parts: Sequence[OpenPart]) -> list[OpenPart]:
     """Determine the inner edges of the scans: those whose centre lies in another scan.
 
     Raises MeasurementError for scans with different pixel types.
@@ -547,7 +547,7 @@ def find_inner_edges(parts: Sequence[Part]) -> list[Part]:
 
 
 def joined_tile(
-    parts: Sequence[Part], canvas: frame_canvas.Canvas, col0: int, row0: int, side: int, degree: Degree
+    parts: Sequence[OpenPart], canvas: frame_canvas.Canvas, col0: int, row0: int, side: int, degree: Degree
 ) -> Tile:
     """Tile of the frame. A pixel that is lost in the preferred scan comes from another one that has it."""
     places = [frame_canvas.scan_places(part.chain, canvas, col0, row0, side) for part in parts]
@@ -568,7 +568,7 @@ def joined_tile(
     return result
 
 
-def _depth(part: Part, columns: Array, rows: Array) -> Array:
+def _depth(part: OpenPart, columns: Array, rows: Array) -> Array:
     """Distance in px of places from the scan's inner edges; -inf outside of the scan."""
     right, bottom = part.source.width_px - 0.5, part.source.height_px - 0.5
     from_edges = np.stack([columns + 0.5, right - columns, rows + 0.5, bottom - rows])
@@ -578,7 +578,7 @@ def _depth(part: Part, columns: Array, rows: Array) -> Array:
         return np.where((from_edges >= 0.0).all(axis=0), depth, -np.inf)
 
 
-def seams_mm(parts: Sequence[Part], canvas: frame_canvas.Canvas) -> list[list[tuple[float, float]]]:
+def seams_mm(parts: Sequence[OpenPart], canvas: frame_canvas.Canvas) -> list[list[tuple[float, float]]]:
     """Seams between the scans: polylines in mm of the camera frame."""
     step = max(canvas.width_px, canvas.height_px) / (_NODES - 1)
     col, row = (np.arange(0.0, size, step) for size in (canvas.width_px, canvas.height_px))

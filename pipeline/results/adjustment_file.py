@@ -27,7 +27,7 @@ AGAIN = "Run `reseau adjust` again; it writes both files."
 
 
 @dataclass(frozen=True)
-class Covariance:
+class ParameterCovariance:
     """A-posteriori covariance of the unknowns, in mm, object units and rad.
 
     Attributes
@@ -43,7 +43,7 @@ class Covariance:
     values: Array
     matrix: Array
     adjustment: str = ""
-    clusters: "Covariance | None" = None
+    clusters: "ParameterCovariance | None" = None
 
     def select(self, parameters: Iterable[Parameter | str]) -> Array:
         """Covariance (k, k) of unknowns given by keys or by their texts in the file; zero for fixed ones, which the
@@ -142,7 +142,7 @@ def covariance_path(path: Path) -> Path:
     return path.with_suffix(".npz")
 
 
-def read_covariance(path: Path) -> Covariance:
+def read_covariance(path: Path) -> ParameterCovariance:
     """Read the covariance of the `adjustment.json` at `path`. Raises InputError if it is missing or damaged."""
     file = covariance_path(path)
     try:
@@ -157,8 +157,8 @@ def read_covariance(path: Path) -> Covariance:
     clusters = None
     if b"cluster_names.npy" in data:
         keys, scatter = _named_matrix(data, "cluster_", file)
-        clusters = Covariance(keys, np.full(len(keys), np.nan), scatter, adjustment)
-    return Covariance(parameters, values.astype(np.float64), matrix, adjustment, clusters)
+        clusters = ParameterCovariance(keys, np.full(len(keys), np.nan), scatter, adjustment)
+    return ParameterCovariance(parameters, values.astype(np.float64), matrix, adjustment, clusters)
 
 
 def _named_matrix(data: bytes, prefix: str, file: Path) -> tuple[tuple[Parameter, ...], Array]:
@@ -179,7 +179,7 @@ def _named_matrix(data: bytes, prefix: str, file: Path) -> tuple[tuple[Parameter
         raise InputError(f"{file}: {error}. {AGAIN}") from None
 
 
-def read_own_covariance(path: Path) -> Covariance:
+def read_own_covariance(path: Path) -> ParameterCovariance:
     """Read the covariance as `read_covariance` does. Raises InputError if it belongs to another adjustment."""
     covariance = read_covariance(path)
     if covariance.adjustment not in ("", hash_file(path)):

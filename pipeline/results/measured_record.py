@@ -12,7 +12,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 import numpy as np
 from pydantic import TypeAdapter
 
-from measure.annotations.lines import Field, Line, find_fields
+from measure.annotations.lines import Line, TextField, find_fields
 from measure.flags import Cause, MeaningfulWord, Reason, Status
 from measure.results import Covariance, FrameMeasurement, Kind, MarkMeasurement, ScanOrientation
 from measure.tone.curve import power, srgb
@@ -263,7 +263,7 @@ def write_frames(path: Path, scans: Iterable[MeasuredScan]) -> bool:
         for line in lines:
             col, row = line.center_px
             place = (f"{line.confidence:.2f}", line.side, f"{col:.0f}", f"{row:.0f}")
-            for each in [one for one in known if one.line is line] or [Field("text", line.text, "", line)]:
+            for each in [one for one in known if one.line is line] or [TextField("text", line.text, "", line)]:
                 rows.append(csv_line((scan.frame.image, each.name, each.text, each.value, *place)))
     if rows:
         write_atomically(path, HEAD.format(version=version("reseau")) + "\n".join([csv_line(COLUMNS), *rows]) + "\n")

@@ -59,7 +59,7 @@ class Handle:
 
 
 @dataclass(frozen=True, eq=False)
-class DrawnMark:
+class ShownMark:
     """Mark shown on the page.
 
     Attributes
@@ -83,7 +83,7 @@ class DrawnMark:
         return -1.0 if self.xy_mm[0] > 0 else 1.0, -1.0 if self.xy_mm[1] > 0 else 1.0
 
 
-def drawn_mark(drawing: camera_drawing.CameraDrawing, placement: camera_drawing.FramePlacement) -> DrawnMark | None:
+def drawn_mark(drawing: camera_drawing.CameraDrawing, placement: camera_drawing.FramePlacement) -> ShownMark | None:
     """Mark shown, None if none is selected."""
     clicked = next((one for one in drawing.marks if one.id == drawing.point), None)
     if clicked is None:
@@ -94,9 +94,9 @@ def drawn_mark(drawing: camera_drawing.CameraDrawing, placement: camera_drawing.
         camera = camera_drawing.drawn_camera(drawing, placement, _NO_FILE)
     except InputError as error:
         sentence = str(error).removeprefix(f"{_NO_FILE}: ").replace(f"[mark.{camera_drawing.MARK}] ", "")
-        return DrawnMark(clicked, xy, None, matrix, sentence)
+        return ShownMark(clicked, xy, None, matrix, sentence)
     mark = next(one.mark for one in camera.fiducials if one.id == clicked.id)
-    return DrawnMark(clicked, xy, mark if isinstance(mark, Mark) else None, matrix)
+    return ShownMark(clicked, xy, mark if isinstance(mark, Mark) else None, matrix)
 
 
 def _pixel_from_mark(placement: camera_drawing.FramePlacement, clicked: camera_drawing.ClickedMark) -> Array:
@@ -126,7 +126,7 @@ def drawing_json(drawing: camera_drawing.CameraDrawing, placement: camera_drawin
     }
 
 
-def _shown_json(drawing: camera_drawing.CameraDrawing, shown: DrawnMark) -> Json:
+def _shown_json(drawing: camera_drawing.CameraDrawing, shown: ShownMark) -> Json:
     own = list(handles(drawing.mark, shown.toward))
     place = _handle_affine(drawing, shown)
     lines = [] if shown.mark is None else outlines_px(shown.mark, shown.pixel_from_mark)
@@ -150,7 +150,7 @@ def _shown_json(drawing: camera_drawing.CameraDrawing, shown: DrawnMark) -> Json
     }
 
 
-def _handle_affine(drawing: camera_drawing.CameraDrawing, shown: DrawnMark) -> Affine:
+def _handle_affine(drawing: camera_drawing.CameraDrawing, shown: ShownMark) -> Affine:
     """Affine from the axes in which a mark is drawn to the scan; those of a radial mark turn with its position."""
     linear = shown.pixel_from_mark[:, :2]
     if drawing.mark.get("rotate") == "radial":

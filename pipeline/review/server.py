@@ -28,7 +28,7 @@ from measure.errors import MeasurementError
 from measure.fiducials.options import Click
 from measure.geometry import POSES
 from pipeline.errors import InputError
-from pipeline.files.decisions_file import Choice, LineError, parse_decision
+from pipeline.files.decisions_file import DecisionKind, LineError, parse_decision
 from pipeline.files.mark_table import MARK_TABLES
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import sample_names
@@ -203,7 +203,7 @@ class _Answers:
             "file": session.camera_name,
             "cameras": len(session.project.cameras),
             "choices": session.choices(),
-            "meaning": {str(choice): choice.meaning for choice in Choice},
+            "meaning": {str(choice): choice.meaning for choice in DecisionKind},
         }
 
     def queue(self, query: Query) -> Any:

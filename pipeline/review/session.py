@@ -294,7 +294,7 @@ class Session:
                 decisions = [replace(one, image=image, fingerprint=own) for one in decisions for image, own in frames]
             complete = [replace(one, who=self.who, when=when) for one in decisions]
             for number, one in enumerate(complete):
-                if one.decision is decisions_file.Choice.LEARN:  # it applies to this file of the scan only
+                if one.decision is decisions_file.DecisionKind.LEARN:  # it applies to this file of the scan only
                     complete[number] = replace(one, fingerprint=content_hash(self.project.scans[one.image]))
             decisions_file.append_decisions(self.project.decisions_path, complete)
             self.refresh()
@@ -427,7 +427,7 @@ class Session:
             if one.image not in self.project.scans:
                 raise InputError(f"there is no image or mark {one.image!r}.")
             wanted = {mark.id for mark in self.project.image_camera(one.image).learned}
-            if one.decision is decisions_file.Choice.LEARN and set(one.px) != wanted:
+            if one.decision is decisions_file.DecisionKind.LEARN and set(one.px) != wanted:
                 marks = ", ".join(sorted(wanted))
                 raise InputError(f"{one.image}: click {marks}: all marks of its camera, and no others.")
             return
@@ -436,7 +436,7 @@ class Session:
             mark = view.mark(one.point, one.subject[2]) if one.point else None
         except KeyError as error:
             raise InputError(f"there is no image or mark {error.args[0]!r}.") from None
-        if one.decision in (decisions_file.Choice.ACCEPT, decisions_file.Choice.REJECT) and (
+        if one.decision in (decisions_file.DecisionKind.ACCEPT, decisions_file.DecisionKind.REJECT) and (
             mark is None or mark.covariance is None
         ):
             raise InputError(

@@ -19,8 +19,8 @@ from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.problem.network import Approximations, Exterior, Image, Network, ObjectPoint, Scanner, Transformation
 from adjust.problem.observations import ObservationKind, Observations
 from synthetic_images.projection import camera_from_object
-from synthetic_images.scene import Distortion as SceneDistortion
 from synthetic_images.scene import Family, SceneCamera
+from synthetic_images.scene import SceneDistortion as SceneDistortion
 
 Array = NDArray[np.float64]
 

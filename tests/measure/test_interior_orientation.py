@@ -20,7 +20,7 @@ from measure.fiducials.measurement import _lacks_its_own, present_frame
 from measure.fiducials.scan_checks import pitch_problem
 from measure.fiducials.scan_orientation import SPOILT, MarkSite, PosedMark, decide_pose
 from measure.fiducials.search import FrameSearch, PitchHypothesis, SearchResult
-from measure.fiducials.stages import Found, Kind, Stage, doubt_frame, find_frame
+from measure.fiducials.stages import Kind, Stage, StageResult, doubt_frame, find_frame
 from measure.flags import MAX_FALSE_FRAMES, NO_REASON, Code, Reason
 from measure.geometry import POSES, UP_FROM_CAMERA
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross, dot
@@ -519,7 +519,7 @@ class Stand:
 
 def search_attempts(
     monkeypatch: pytest.MonkeyPatch, *expected: float | None, given: int = 1, at_given: int | None = None
-) -> tuple[Found, list[int]]:
+) -> tuple[StageResult, list[int]]:
     """What a list of attempts comes to, each of two hypotheses and with so many frames that chance is expected to make
     a hypothesis, and how many hypotheses each was judged by. given: how many of them believe what they find; at_given:
     which of the others is under the given pitch."""
@@ -545,7 +545,7 @@ def search_attempts(
     return find_frame(SCAN, ALIKE, None, FiducialOptions()), checked
 
 
-def name(found: Found) -> str:
+def name(found: StageResult) -> str:
     return cast(Stand, found.frame).name if found.frame else ""
 
 

@@ -31,7 +31,16 @@ from measure.scans.opening import crop_scan
 from measure.tone.curve import LINEAR
 from synthetic_images.areas import disk
 from synthetic_images.render import render_scene
-from synthetic_images.scene import DrawnMark, Film, Scanner, Scene, SceneCamera, SceneFiducial, SceneImage, Tones
+from synthetic_images.scene import (
+    DrawnMark,
+    Scene,
+    SceneCamera,
+    SceneFiducial,
+    SceneFilm,
+    SceneImage,
+    SceneScanner,
+    Tones,
+)
 
 # A frame of 14 mm with a hundredth of the usual tolerances bends as little as one of 140 mm.
 STIFF = FiducialOptions(pose="0", misfit_mm=0.03, affinity=1e-4, gate_mm=0.03)
@@ -261,8 +270,8 @@ RADIUS_MM, OBLIQUE_FILM_PITCH_UM, FRAME_MM = 1.5, 200.0, (228.0, 228.0)
 def test_balls_under_a_perspective_are_found_and_the_perspective_is_named(tmp_path: Path) -> None:
     ball = DrawnMark((disk((0.0, 0.0), RADIUS_MM),))
     camera = SceneCamera("film", FRAME_MM, 150.0, fiducials=tuple(SceneFiducial(*one, ball) for one in PLACES.items()))
-    film = Film("projective", tilt_deg=float(np.degrees(np.arcsin(0.04 * 600.0 / 212.0))), tilt_direction_deg=40.0)
-    scanner = Scanner((OBLIQUE_FILM_PITCH_UM, OBLIQUE_FILM_PITCH_UM), margin_mm=6.0, noise=0.01)
+    film = SceneFilm("projective", tilt_deg=float(np.degrees(np.arcsin(0.04 * 600.0 / 212.0))), tilt_direction_deg=40.0)
+    scanner = SceneScanner((OBLIQUE_FILM_PITCH_UM, OBLIQUE_FILM_PITCH_UM), margin_mm=6.0, noise=0.01)
     image = SceneImage("f", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0))
     scene = Scene("film", 1, camera, hidden_field(), (image,), scanner, film, Tones(contrast=0.0))
     (truth,) = render_scene(scene, tmp_path).frames

@@ -23,7 +23,7 @@ from measure.scans import jpeg, remote
 from measure.scans.opening import declared_tone, open_scan, read_head
 from measure.scans.parallel import map_in_threads, map_or_replace
 from measure.scans.remote import Address, scan_path
-from measure.targets.block_search import Block, Octave, Patches, search_blocks
+from measure.targets.block_search import Octave, Patches, ScanBlock, search_blocks
 from measure.targets.detection import DiskSearch, disk_candidates
 
 
@@ -106,7 +106,7 @@ def test_the_cache_holds_two_rows_of_tiles_and_keeps_its_limit(tmp_path: Path, m
 def test_a_block_is_a_part_of_the_scan_and_of_its_reductions(tmp_path: Path, channels: int) -> None:
     tifffile.imwrite(tmp_path / "s.tif", picture(np.uint16, channels), tile=(32, 48), compression="lzw")
     with open_scan(tmp_path / "s.tif") as scan:
-        block = Block(scan, (12, 0), 12, scan.samples(12, 0, 72, 60))
+        block = ScanBlock(scan, (12, 0), 12, scan.samples(12, 0, 72, 60))
         rows, cols = np.indices((40, 40)).reshape(2, 1, -1)
         for col0, row0 in ((20, 3), (31, 4)):
             grey = block.grey_values(np.array([[col0, row0]]), cols, rows)

@@ -13,7 +13,7 @@ from studies import parametrize_with_studies
 from measure import MarkMeasurement, Scan, Status, TargetOptions, TargetPrediction, measure_crosses, measure_disks
 from measure.flags import NO_REASON, Cause
 from measure.results import Covariance, SecondPlace
-from measure.targets.block_search import Candidate
+from measure.targets.block_search import TargetCandidate
 from measure.targets.consistency import TargetPlaces, compare_targets
 from measure.targets.detection import CrossSearch, DiskSearch, cross_candidates, disk_candidates
 from measure.targets.disks import FittedDisk, dust_reasons, fit_disk, fit_plain_disks
@@ -257,7 +257,7 @@ def test_many_disks_at_once_are_placed_as_their_sigmas_say(monkeypatch: pytest.M
         place, shape = corner + rng.uniform(23.5, 24.5, 2), some_ellipse(rng, 9.0, 0.8)
         window = picture[corner[1] : corner[1] + 48, corner[0] : corner[0] + 64]
         window += CONTRAST * draw(ellipse(place - corner, shape), 64, 48, 0.9)
-        starts.append(Candidate(place + rng.normal(0, 0.2, 2), shape * rng.uniform(0.95, 1.05), CONTRAST))
+        starts.append(TargetCandidate(place + rng.normal(0, 0.2, 2), shape * rng.uniform(0.95, 1.05), CONTRAST))
         true.append(place)
     covered = true[0] - 9.0
     picture[max(round(covered[1]), 0) : round(covered[1]) + 9, round(covered[0]) : round(covered[0]) + 18] = GROUND
@@ -412,10 +412,10 @@ def ringed(number: int, code: RingCode, turn: float, light: bool = False, tilt: 
     return make_scan((12000 + 30000 * picture if light else 45000 - 30000 * picture) + noise)
 
 
-def dot(light: bool = False, spin: float = 0.0) -> Candidate:
+def dot(light: bool = False, spin: float = 0.0) -> TargetCandidate:
     """The dot as a search finds it: an ellipse, whose axes say nothing of its circle's turn."""
     turn = np.array([[np.cos(spin), -np.sin(spin)], [np.sin(spin), np.cos(spin)]])
-    return Candidate(CENTER + np.array([0.2, -0.1]), 1.03 * SHAPE @ turn, 30000.0 if light else -30000.0)
+    return TargetCandidate(CENTER + np.array([0.2, -0.1]), 1.03 * SHAPE @ turn, 30000.0 if light else -30000.0)
 
 
 @pytest.mark.parametrize(

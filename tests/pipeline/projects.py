@@ -27,7 +27,7 @@ from pipeline.cli import DONE, LOOK, run
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_measurement import measured_scan
 from pipeline.measuring.scan_task import scan_tasks
-from pipeline.provenance import FileState, Identity, file_state, parts_hash
+from pipeline.provenance import FileIdentity, FileState, file_state, parts_hash
 from pipeline.results.comparator_file import ComparatorPoint, read_measurement_hash
 from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan, mark_row, scan_detail
 
@@ -284,7 +284,7 @@ def kept_result(seed: int = 1, options: str = "{}", mtime_ns: int = 1, scan: Mea
     """A result of a scan of its own."""
     state = FileState(f"scans/{seed}.tif", 1000 + seed, mtime_ns)
     parts = hashlib.sha256(str(seed).encode()).hexdigest()
-    return Kept(Identity(state, parts), options, scan or made_record(seed), camera="camera.toml")
+    return Kept(FileIdentity(state, parts), options, scan or made_record(seed), camera="camera.toml")
 
 
 def content(scan: MeasuredScan) -> tuple[object, ...]:
@@ -305,7 +305,7 @@ def keep_scans(path: Path, scans: Sequence[MeasuredScan], made_from: Mapping[str
         store.set_project_folder(folder)
         frames = []
         for scan in scans:
-            identity = Identity(file_state(Path(scan.scan), folder), parts_hash(Path(scan.scan)))
+            identity = FileIdentity(file_state(Path(scan.scan), folder), parts_hash(Path(scan.scan)))
             row = store.keep(Kept(identity, "{}", scan), scan.frame.image)
             frames.append(CheckedResult(row, scan))
         return judge(store, made_from or {}, "kept", frames).digest

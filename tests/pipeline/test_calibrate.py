@@ -33,14 +33,14 @@ from pipeline import InputError
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.picture_turn import turned_back
 from pipeline.calibration import calibrate_stage, intrinsics
-from pipeline.calibration.calibrate_stage import Calibration
+from pipeline.calibration.calibrate_stage import CalibrationResult
 from pipeline.calibration.intrinsics import LensChoice, LensModel, choose_lens
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures
 from pipeline.calibration.project_files import CalibrationOptions, board_options, write_project
 from pipeline.files.target_table import read_targets
 from pipeline.measuring.repeated_views import check_repeated_views
 from pipeline.opencv_check.check import BoardPictures, compare_corners, detector_name, find_points
-from pipeline.opencv_check.opencv_calibration import NAMES, Freedom, ImagePoints, OpenCvCalibration, calibrate
+from pipeline.opencv_check.opencv_calibration import NAMES, Freedom, OpenCvCalibration, OpenCVPoints, calibrate
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.tables import Table
@@ -93,12 +93,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-def images() -> list[ImagePoints]:
+def images() -> list[OpenCVPoints]:
     """The exact places of all corners, as if they had been measured."""
-    return [ImagePoints(f"p{k}", POINTS, corners_px(k) * [PITCH_MM, -PITCH_MM]) for k in range(len(TURNS))]
+    return [OpenCVPoints(f"p{k}", POINTS, corners_px(k) * [PITCH_MM, -PITCH_MM]) for k in range(len(TURNS))]
 
 
-def calibrated(given: Sequence[ImagePoints]) -> OpenCvCalibration:
+def calibrated(given: Sequence[OpenCVPoints]) -> OpenCvCalibration:
     start = np.zeros(len(NAMES))
     start[:4] = PITCH_MM * np.array([FOCAL_PX, FOCAL_PX, CENTER_PX[0], -CENTER_PX[1]])
     return calibrate(given, Freedom(("fx", "fy", "cx", "cy")), start)
@@ -168,17 +168,17 @@ def calibrated_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def calibrations() -> list[Calibration]:
+def calibrations() -> list[CalibrationResult]:
     """What `result` was made of, behind it."""
     return []
 
 
 @pytest.fixture(scope="module")
-def result(calibrated_folder: Path, calibrations: list[Calibration]) -> dict[str, Any]:
+def result(calibrated_folder: Path, calibrations: list[CalibrationResult]) -> dict[str, Any]:
     """What the command prints; its files stand in the folder `calibration`."""
     out, printed, calibrate = calibrated_folder / "calibration", io.StringIO(), calibrate_stage.calibrate
 
-    def keep(*arguments: Any, **options: Any) -> Calibration:
+    def keep(*arguments: Any, **options: Any) -> CalibrationResult:
         calibrations.append(calibrate(*arguments, **options))
         return calibrations[-1]
 
@@ -230,7 +230,7 @@ def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any],
     assert "fiducial marks in the images" not in report
 
 
-def test_the_chosen_lens_is_printed(result: dict[str, Any], calibrations: list[Calibration]) -> None:
+def test_the_chosen_lens_is_printed(result: dict[str, Any], calibrations: list[CalibrationResult]) -> None:
     (camera,) = calibrations[0].cameras
     scores: dict[LensModel, float | None] = {"opencv4": 0.1624, "opencv5": 0.158, "fisheye": None}
     text = io.StringIO()
@@ -242,7 +242,7 @@ def test_the_chosen_lens_is_printed(result: dict[str, Any], calibrations: list[C
 
 
 def test_a_calibration_is_plotted_and_shown_in_a_notebook(
-    result: dict[str, Any], calibrations: list[Calibration], monkeypatch: pytest.MonkeyPatch
+    result: dict[str, Any], calibrations: list[CalibrationResult], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (calibration,) = calibrations
     mpl.use("Agg")

@@ -19,7 +19,7 @@ from review_server import comparator, decisions, served, steer
 
 from measure import open_scan
 from pipeline import InputError, read_camera
-from pipeline.files.decisions_file import Choice, Decision, append_decisions
+from pipeline.files.decisions_file import Decision, DecisionKind, append_decisions
 from pipeline.files.mark_table import MARK_TABLES
 from pipeline.files.project_file import read_project, read_undrawn
 from pipeline.review.camera_drawing import (
@@ -340,16 +340,16 @@ def test_marks_of_one_scan_are_saved_as_a_camera_file(project: Path) -> None:
 
 def learn(image: str, points: str = "1234", **rest: Any) -> Decision:
     px = {point: tuple(np.round(place).tolist()) for point, place in zip(points, learned_px(image), strict=False)}
-    return Decision(image, Choice.LEARN, kind="learned", px=px, **rest)
+    return Decision(image, DecisionKind.LEARN, kind="learned", px=px, **rest)
 
 
 def test_the_last_scan_that_was_shown_counts_but_for_the_camera_files(project: Path) -> None:
     path = project.with_name("decisions.jsonl")
-    append_decisions(path, [learn("a", who="ann"), learn("c"), Decision("a", Choice.REJECT, "1", "fiducial")])
+    append_decisions(path, [learn("a", who="ann"), learn("c"), Decision("a", DecisionKind.REJECT, "1", "fiducial")])
     assert project_clicks(project) == ("c", "somebody")
-    append_decisions(path, [Decision("c", Choice.UNDO, kind="learned")])
+    append_decisions(path, [Decision("c", DecisionKind.UNDO, kind="learned")])
     assert project_clicks(project) == ("a", "ann")
-    append_decisions(path, [Decision("a", Choice.UNDO), Decision("a", Choice.UNDO, kind="learned")])
+    append_decisions(path, [Decision("a", DecisionKind.UNDO), Decision("a", DecisionKind.UNDO, kind="learned")])
     assert project_clicks(project) is None
     with project.with_name("camera.toml").open("a") as camera:
         camera.write('[clicks]\nscan = "b.tif"\n[clicks.px]\n' + "".join(f"{point} = [5, 5]\n" for point in "1234"))

@@ -60,8 +60,8 @@ from pipeline.exchange.tables import _check_words
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.text.files import file_word, path_below
 from synthetic_images.projection import camera_from_object, object_rotation
-from synthetic_images.scene import Distortion as SceneDistortion
 from synthetic_images.scene import Family, SceneCamera
+from synthetic_images.scene import SceneDistortion as SceneDistortion
 
 Array = NDArray[np.float64]
 

@@ -34,7 +34,7 @@ from pipeline.archive.status import archive_status
 from pipeline.exchange.exchange_stage import run_export, run_import
 from pipeline.exchange.formats import ExportOptions
 from pipeline.exchange.incoming import ImportOptions
-from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions
+from pipeline.files.decisions_file import Decision, DecisionKind, append_decisions, read_decisions
 from pipeline.results.measured_record import FailureCode, mark_row, scan_detail
 from pipeline.review.session import build_queue
 from pipeline.text.files import names_below
@@ -163,7 +163,7 @@ def measured_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("hostile") / "p"
     project = write_project(folder, ["a", "b", "c"])
     assert command("measure", project) == 0
-    append_decisions(folder / "decisions.jsonl", [Decision("b", Choice.REJECT, "1", "fiducial", who="ann")])
+    append_decisions(folder / "decisions.jsonl", [Decision("b", DecisionKind.REJECT, "1", "fiducial", who="ann")])
     command("measure", project)
     with sqlite3.connect(folder / "out" / "measurement.db") as db:
         db.execute("pragma wal_checkpoint(truncate)")
@@ -307,7 +307,7 @@ def decisions_trial(rng: random.Random, folder: Path, adjusted: Path) -> str:
     """A file of good lines, one of them spoiled: all good ones are read, or the bad one is named; and appending writes
     all of a batch or nothing."""
     path = folder / "decisions.jsonl"
-    choices = (Choice.ACCEPT, Choice.REJECT, Choice.ABSENT, Choice.UNDO)
+    choices = (DecisionKind.ACCEPT, DecisionKind.REJECT, DecisionKind.ABSENT, DecisionKind.UNDO)
     lines = [Decision(rng.choice("abz"), rng.choice(choices), rng.choice("129"), "fiducial") for _ in range(8)]
     append_decisions(path, lines)
     if is_spoilt := rng.random() < 0.7:
@@ -315,7 +315,7 @@ def decisions_trial(rng: random.Random, folder: Path, adjusted: Path) -> str:
     read = read_decisions(path)
     if not is_spoilt and read != tuple(lines):
         return WRONG
-    bad = Decision("a", Choice.PLACE, "1", "fiducial", col_px=rng.choice([float("nan"), 1e300]), row_px=1.0)
+    bad = Decision("a", DecisionKind.PLACE, "1", "fiducial", col_px=rng.choice([float("nan"), 1e300]), row_px=1.0)
     before = path.read_bytes()
     try:
         append_decisions(path, [lines[0], bad])

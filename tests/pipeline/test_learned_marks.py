@@ -43,7 +43,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     mark = scene.DrawnMark((ARROW,))
     fiducials = tuple(scene.SceneFiducial(id, place, mark) for id, place in CORNERS.items())
     camera = scene.SceneCamera("small", (16.0, 16.0), 30.0, fiducials=fiducials)
-    scanner = scene.Scanner((50.0, 50.0), margin_mm=1.0, noise=0.004)
+    scanner = scene.SceneScanner((50.0, 50.0), margin_mm=1.0, noise=0.004)
     field = scene.DiskField((), 1.0)
     made = scene.Scene("learned", 3, camera, field, images, scanner, background="terrain", pad_mm=1.6)
     render_scene(made, folder)

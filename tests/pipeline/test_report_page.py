@@ -21,7 +21,7 @@ from adjust.quality.significance import Correlation
 from adjust.solution.explanations import Explanation
 from measure import Code, MarkMeasurement, Reason, ScanOrientation, Status
 from measure.results import FrameMeasurement
-from pipeline.report import Problem, ReportData, judge, render_report, write_report
+from pipeline.report import ReportData, ReportedProblem, judge, render_report, write_report
 from pipeline.report.data import frames
 from pipeline.report.frame_problems import fraction_test, places_px
 from pipeline.report.parameters import spoken_name
@@ -189,7 +189,7 @@ def test_only_measured(measured_data: ReportData) -> None:
     assert "These marks are not adjusted yet: run <code>reseau run</code>." in page
     assert "<dt>of which</dt>" in page
     assert re.search(r">noise 0\.041</span>, <span [^>]*>tone 0\.020</span> px", page)
-    problem = Problem("It is <stale>. So says `reseau status`.", "Run `reseau measure`.")
+    problem = ReportedProblem("It is <stale>. So says `reseau status`.", "Run `reseau measure`.")
     page = render_report(replace(measured_data, problems=(problem,)))
     for words in ("It is &lt;stale&gt;.", "So says <code>reseau status</code>.", "Run <code>reseau measure</code>."):
         assert words in page
@@ -267,7 +267,7 @@ def test_without_a_result_the_report_says_why() -> None:
 def test_what_the_user_named_is_escaped(adjusted_data: ReportData) -> None:
     name = '<script>alert("x")</script> & Co'
     data = set_mark(adjusted_data, 0, Status.WEAK, name)
-    html = render_report(replace(data, project=name, problems=(Problem(name, name),)))
+    html = render_report(replace(data, project=name, problems=(ReportedProblem(name, name),)))
     Document(html)
     assert "<script>alert" not in html
     assert "&lt;script&gt;alert" in html
@@ -435,7 +435,7 @@ def test_the_table_of_exit_code_1_is_that_of_the_code() -> None:
 def test_problems_and_notes_of_frames_and_callers_are_kept(measured_data: ReportData) -> None:
     dark = (Reason("nearly black.", Code.NO_FRAME),)
     data = set_frames(measured_data, lambda frame: replace(frame, problems=dark) if frame.image == "f4" else frame)
-    data = replace(data, problems=(Problem("points.csv: 99 was not measured."),))
+    data = replace(data, problems=(ReportedProblem("points.csv: 99 was not measured."),))
     assert "f4: nearly black." in describe(data)
     assert "99 was not measured" in describe(data)
     note = "The file's orientation tag (6) is not applied."

@@ -29,7 +29,7 @@ from pipeline.report.load import report_data
 from pipeline.report.numbers import value_and_sigma
 from pipeline.report.parameters import parameter_rows
 from pipeline.report.plots import calibrated_cameras
-from pipeline.results.adjustment_file import Covariance
+from pipeline.results.adjustment_file import ParameterCovariance
 from pipeline.results.adjustment_record import (
     CameraRecord,
     DistortionRecord,
@@ -176,8 +176,10 @@ def camera(family: str, c_mm: float = 153.0, **parameters: float) -> CameraRecor
     )
 
 
-def covariance(name: str, parameters: tuple[str, ...], matrix: Array) -> Covariance:
-    return Covariance(tuple(Parameter.interior(name, each) for each in parameters), np.zeros(len(parameters)), matrix)
+def covariance(name: str, parameters: tuple[str, ...], matrix: Array) -> ParameterCovariance:
+    return ParameterCovariance(
+        tuple(Parameter.interior(name, each) for each in parameters), np.zeros(len(parameters)), matrix
+    )
 
 
 WIDE_FRAME = vectors.Plane(np.array([[-75.0, -75.0], [75.0, 75.0]]), 500.0)
@@ -240,7 +242,9 @@ def fiducials(estimated: Array) -> dict[str, FiducialRecord]:
 
 def changed(estimated: Array, matrix: Array) -> Figure:
     places = tuple(Parameter.fiducial("A", str(i), axis) for i in range(len(GIVEN)) for axis in "xy")
-    return present(figure_of_films("A", fiducials(estimated), Covariance(places, estimated.ravel(), matrix), {}))
+    return present(
+        figure_of_films("A", fiducials(estimated), ParameterCovariance(places, estimated.ravel(), matrix), {})
+    )
 
 
 def test_a_similarity_changes_no_form_and_a_displaced_mark_does() -> None:
@@ -254,7 +258,7 @@ def test_a_similarity_changes_no_form_and_a_displaced_mark_does() -> None:
     assert int(np.hypot(*form.change_um.T).argmax()) == 3
     assert "enlarged" in figure_plot(form)
     two = dict(list(fiducials(GIVEN).items())[:2])
-    assert figure_of_films("A", two, Covariance((), np.empty(0), np.empty((0, 0))), {}) is None
+    assert figure_of_films("A", two, ParameterCovariance((), np.empty(0), np.empty((0, 0))), {}) is None
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ from pipeline import read_project
 from pipeline.archive.review_decisions import after_checks, apply_decisions, before_checks
 from pipeline.errors import InputError, WriteError
 from pipeline.files.camera_file import CameraFile
-from pipeline.files.decisions_file import Choice, Decision, append_decisions, read_decisions, standing
+from pipeline.files.decisions_file import Decision, DecisionKind, append_decisions, read_decisions, standing
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.review.pictures import Pictures, _overlapping_pixels
@@ -228,7 +228,7 @@ def test_the_next_question_that_is_left_is_reported_wherever_it_stands(measured_
     session = Session(read_project(measured_folder / "project.toml"), "bob")
     for expected, entry in zip((1, 2), session.page(Filters())["entries"][1:], strict=True):
         assert session.page(Filters(), start=1)["next_left"] == expected
-        about = (entry["image"], Choice.ABSENT, entry["point"], "fiducial")
+        about = (entry["image"], DecisionKind.ABSENT, entry["point"], "fiducial")
         session.decide([Decision(*about, fingerprint=entry["fingerprint"])])
     assert session.page(Filters(), start=1)["next_left"] == 0
     assert session.page(Filters(question="mark"))["next_left"] == -1
@@ -271,12 +271,12 @@ def no_pose(_: str) -> None:
     """In the stand-in for the store no result tells its pose."""
 
 
-def mark_decision(choice: Choice, point: str = "1", **rest: Any) -> Decision:
+def mark_decision(choice: DecisionKind, point: str = "1", **rest: Any) -> Decision:
     return Decision("a", choice, point, "fiducial", **rest)
 
 
 def place(point: str, col_px: float, **rest: Any) -> Decision:
-    return mark_decision(Choice.PLACE, point, col_px=col_px, row_px=2.0, **rest)
+    return mark_decision(DecisionKind.PLACE, point, col_px=col_px, row_px=2.0, **rest)
 
 
 @pytest.fixture
@@ -285,20 +285,20 @@ def path(tmp_path: Path) -> Path:
 
 
 def test_a_line_cut_short_does_not_count_and_the_next_one_stands_by_itself(path: Path) -> None:
-    append_decisions(path, [mark_decision(Choice.ACCEPT)])
+    append_decisions(path, [mark_decision(DecisionKind.ACCEPT)])
     whole = path.read_bytes()
     path.write_bytes(whole + b'{"image": "a", "deci')
-    assert read_decisions(path) == (mark_decision(Choice.ACCEPT),)
-    append_decisions(path, [mark_decision(Choice.REJECT)])
-    assert [one.decision for one in read_decisions(path)] == [Choice.ACCEPT, Choice.REJECT]
+    assert read_decisions(path) == (mark_decision(DecisionKind.ACCEPT),)
+    append_decisions(path, [mark_decision(DecisionKind.REJECT)])
+    assert [one.decision for one in read_decisions(path)] == [DecisionKind.ACCEPT, DecisionKind.REJECT]
     path.write_bytes(whole.rstrip(b"\n"))  # as an editor leaves it
-    append_decisions(path, [mark_decision(Choice.REJECT)])
-    assert [one.decision for one in read_decisions(path)] == [Choice.ACCEPT, Choice.REJECT]
+    append_decisions(path, [mark_decision(DecisionKind.REJECT)])
+    assert [one.decision for one in read_decisions(path)] == [DecisionKind.ACCEPT, DecisionKind.REJECT]
 
 
 def test_a_full_disk_takes_all_lines_back(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a roll, decided at once: none of its lines counts, and the message says so."""
-    append_decisions(path, [mark_decision(Choice.ACCEPT)])
+    append_decisions(path, [mark_decision(DecisionKind.ACCEPT)])
     before = path.read_bytes()
 
     def full(_: int) -> None:
@@ -307,7 +307,7 @@ def test_a_full_disk_takes_all_lines_back(path: Path, tmp_path: Path, monkeypatc
     with monkeypatch.context() as broken:
         broken.setattr("pipeline.text.files.os.fsync", full)
         with pytest.raises(WriteError, match="Nothing was changed there"):
-            append_decisions(path, [Decision(f"f{k}", Choice.POSE, pose="90") for k in range(120)])
+            append_decisions(path, [Decision(f"f{k}", DecisionKind.POSE, pose="90") for k in range(120)])
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
 
@@ -317,29 +317,29 @@ def test_a_full_disk_takes_all_lines_back(path: Path, tmp_path: Path, monkeypatc
     [
         place("1", float("nan")),
         place("1", 1e300),
-        mark_decision(Choice.ACCEPT, window=(0.0, float("inf"), 1.0, 1.0)),
-        Decision("a", Choice.LEARN, px={"1": (float("nan"), 0.0)}),
-        mark_decision(Choice.ACCEPT, when="now"),
-        mark_decision(Choice.ACCEPT, note="\ud800"),
-        Decision("a", Choice.ACCEPT),
+        mark_decision(DecisionKind.ACCEPT, window=(0.0, float("inf"), 1.0, 1.0)),
+        Decision("a", DecisionKind.LEARN, px={"1": (float("nan"), 0.0)}),
+        mark_decision(DecisionKind.ACCEPT, when="now"),
+        mark_decision(DecisionKind.ACCEPT, note="\ud800"),
+        Decision("a", DecisionKind.ACCEPT),
     ],
 )
 def test_what_would_not_be_read_is_not_written(decision: Decision, path: Path) -> None:
     with pytest.raises(InputError, match=r"the decision about a.*Nothing was written"):
-        append_decisions(path, [mark_decision(Choice.ACCEPT), decision])
+        append_decisions(path, [mark_decision(DecisionKind.ACCEPT), decision])
     assert not path.exists()
 
 
 @pytest.mark.parametrize("line", ['{"image": "a" "point": "1"}', "nothing", "{'image': 'a'}"])
 def test_a_typing_error_in_the_last_line_is_named(line: str, path: Path) -> None:
-    append_decisions(path, [mark_decision(Choice.ACCEPT)])
+    append_decisions(path, [mark_decision(DecisionKind.ACCEPT)])
     with path.open("a") as file:
         file.write(line)
     before = path.read_bytes()
     with pytest.raises(InputError, match=r"line 2: is no JSON"):
         read_decisions(path)
     with pytest.raises(InputError, match=r"its last line: is no JSON.*Nothing was written"):
-        append_decisions(path, [mark_decision(Choice.REJECT)])
+        append_decisions(path, [mark_decision(DecisionKind.REJECT)])
     assert path.read_bytes() == before
 
 
@@ -348,10 +348,10 @@ def test_lines_that_do_not_apply_are_named_and_do_not_count(tmp_path: Path, prin
     project = write_project(tmp_path / "p", ["a", "b"])
     path = project.with_name("decisions.jsonl")
     unknown = [
-        Decision("z", Choice.REJECT, "1", "fiducial", who="ann"),
-        mark_decision(Choice.REJECT, "99", who="ann"),
-        mark_decision(Choice.UNDO, "2"),
-        mark_decision(Choice.REJECT, "3", fingerprint="another result"),
+        Decision("z", DecisionKind.REJECT, "1", "fiducial", who="ann"),
+        mark_decision(DecisionKind.REJECT, "99", who="ann"),
+        mark_decision(DecisionKind.UNDO, "2"),
+        mark_decision(DecisionKind.REJECT, "3", fingerprint="another result"),
     ]
     append_decisions(path, unknown)
     with path.open("a") as file:
@@ -386,16 +386,18 @@ def test_a_million_lines_are_read_in_little_more_than_their_json_takes(path: Pat
 def test_lines_of_all_forms_are_read_in_their_order(path: Path) -> None:
     """Many at once, as of an archive, with blank lines between them."""
     forms: Sequence[tuple[dict[str, Any], Decision]] = [
-        ({"image": "a", "point": "7", "decision": "accept"}, Decision("a", Choice.ACCEPT, "7")),
+        ({"image": "a", "point": "7", "decision": "accept"}, Decision("a", DecisionKind.ACCEPT, "7")),
         (
             {"decision": "place", "image": "b", "point": "7", "kind": "target", "col_px": 3, "row_px": 4.5},
-            Decision("b", Choice.PLACE, "7", "target", 3.0, 4.5),
+            Decision("b", DecisionKind.PLACE, "7", "target", 3.0, 4.5),
         ),
         (
             {"image": "d", "decision": "learn", "px": {"1": [2, 3.5]}, "who": "ann", "window": [0, 1, 2, 3]},
-            Decision("d", Choice.LEARN, kind="learned", who="ann", window=(0.0, 1.0, 2.0, 3.0), px={"1": (2.0, 3.5)}),
+            Decision(
+                "d", DecisionKind.LEARN, kind="learned", who="ann", window=(0.0, 1.0, 2.0, 3.0), px={"1": (2.0, 3.5)}
+            ),
         ),
-        ({"image": "e", "decision": "undo", "row_px": 0.0}, Decision("e", Choice.UNDO, row_px=0.0)),
+        ({"image": "e", "decision": "undo", "row_px": 0.0}, Decision("e", DecisionKind.UNDO, row_px=0.0)),
     ]
     chosen = np.random.default_rng(3).integers(len(forms), size=200).tolist()
     lines = [json.dumps(forms[form][0]) for form in chosen]
@@ -430,21 +432,23 @@ def test_a_wrong_line_is_named(line: str, words: str, path: Path) -> None:
 
 
 def test_decisions_count_in_their_order_and_of_their_own_result() -> None:
-    accept, reject, undo = (mark_decision(choice) for choice in (Choice.ACCEPT, Choice.REJECT, Choice.UNDO))
+    accept, reject, undo = (
+        mark_decision(choice) for choice in (DecisionKind.ACCEPT, DecisionKind.REJECT, DecisionKind.UNDO)
+    )
     about = accept.subject
     assert standing([accept, reject])[about] is reject
     assert standing([accept, reject, undo])[about] is accept
     assert standing([accept, undo, undo, reject])[about] is reject
     assert standing([accept, undo]) == {}
-    old = mark_decision(Choice.ACCEPT, fingerprint="another file")
-    own = mark_decision(Choice.REJECT, "2", fingerprint=task_key(TASK))
+    old = mark_decision(DecisionKind.ACCEPT, fingerprint="another file")
+    own = mark_decision(DecisionKind.REJECT, "2", fingerprint=task_key(TASK))
     assert list(apply_decisions(TASK, [old, own], task_key, no_pose)[1].values()) == [own]
     # Accepted, then another mark placed, then, on what was measured from that, one more rejected.
-    accept = mark_decision(Choice.ACCEPT, "1", fingerprint=task_key(TASK))
+    accept = mark_decision(DecisionKind.ACCEPT, "1", fingerprint=task_key(TASK))
     placed = place("2", 7.0, fingerprint=task_key(TASK))
     now, _ = apply_decisions(TASK, [accept, placed], task_key, no_pose)
     assert now.options.fiducials.clicks == (Click("2", 7.0, 2.0),)
-    reject = mark_decision(Choice.REJECT, "3", fingerprint=task_key(now))
+    reject = mark_decision(DecisionKind.REJECT, "3", fingerprint=task_key(now))
     assert set(apply_decisions(TASK, [accept, placed, reject], task_key, no_pose)[1].values()) == {
         accept,
         placed,
@@ -454,17 +458,19 @@ def test_decisions_count_in_their_order_and_of_their_own_result() -> None:
 
 def test_decisions_about_marks_count_in_the_pose_in_which_they_were_found() -> None:
     placed = place("2", 7.0, fingerprint=task_key(TASK))
-    pose = Decision("a", Choice.POSE, pose="90", fingerprint=task_key(TASK))
-    late = mark_decision(Choice.ACCEPT, "3", fingerprint=task_key(TASK))  # on a page that was not measured anew yet
+    pose = Decision("a", DecisionKind.POSE, pose="90", fingerprint=task_key(TASK))
+    late = mark_decision(
+        DecisionKind.ACCEPT, "3", fingerprint=task_key(TASK)
+    )  # on a page that was not measured anew yet
     now, counting = apply_decisions(TASK, [pose, late], task_key, no_pose)
     assert now.options.fiducials.pose == "90"
     assert list(counting.values()) == [pose]
     other = replace(pose, pose="180")  # somebody thinks again, on that page
     assert apply_decisions(TASK, [pose, other], task_key, no_pose)[0].options.fiducials.pose == "180"
-    undone = Decision("a", Choice.UNDO, fingerprint="whatever is shown")
+    undone = Decision("a", DecisionKind.UNDO, fingerprint="whatever is shown")
     assert apply_decisions(TASK, [placed, pose, undone], task_key, no_pose)[0].options.fiducials.pose == "auto"
     # Decided on one page, the pose first or last, before it is measured anew.
-    early, late = (mark_decision(Choice.ACCEPT, point, fingerprint=task_key(TASK)) for point in "13")
+    early, late = (mark_decision(DecisionKind.ACCEPT, point, fingerprint=task_key(TASK)) for point in "13")
     found = {task_key(TASK): "90"}
     now, counting = apply_decisions(TASK, [early, pose, late], task_key, found.get)
     assert now.options.fiducials.pose == "90"
@@ -483,7 +489,7 @@ def weak(point: str, kind: Any = "fiducial") -> MarkMeasurement:
 
 
 def test_a_mark_becomes_what_was_settled_and_says_by_whom() -> None:
-    choices = {"1": Choice.ACCEPT, "2": Choice.REJECT, "3": Choice.ABSENT}
+    choices = {"1": DecisionKind.ACCEPT, "2": DecisionKind.REJECT, "3": DecisionKind.ABSENT}
     counting = {one.subject: one for id, choice in choices.items() if (one := mark_decision(choice, id, who="ann"))}
     scan = make_scan(*(weak(point) for point in "1234"))
     before, after = before_checks(scan, counting), after_checks(scan, counting)
@@ -496,9 +502,9 @@ def test_a_mark_becomes_what_was_settled_and_says_by_whom() -> None:
     assert after.reviewers == {"ann": 3}
     assert after_checks(scan, {}) == scan
     bare = MarkMeasurement("1", "fiducial", np.ones(2), None, Status.PREDICTED, Reason("not seen", Code.NOT_FOUND))
-    one = mark_decision(Choice.ACCEPT)
+    one = mark_decision(DecisionKind.ACCEPT)
     assert after_checks(make_scan(bare), {one.subject: one}).frame.marks[0].status is Status.PREDICTED
-    one = Decision("a", Choice.PLACE, "1", "target", col_px=50.0, row_px=60.0)
+    one = Decision("a", DecisionKind.PLACE, "1", "target", col_px=50.0, row_px=60.0)
     (mark,) = after_checks(make_scan(weak("1", "target")), {one.subject: one}).frame.marks
     assert mark.status is Status.WEAK
     np.testing.assert_array_equal(np.asarray(mark.center_px), (50.0, 60.0))
@@ -511,7 +517,7 @@ def test_what_is_settled_is_not_open_and_commands_say_whose(tmp_path: Path, caps
     with project.with_name("camera.toml").open("a") as camera:
         camera.write('[[fiducial]]\nid = "5"\nxy_mm = [7.0, 0.0]\nsigma_mm = 0.01\nmark = "m"\n')
     assert command("measure", project) == 1
-    append_decisions(project.with_name("decisions.jsonl"), [mark_decision(Choice.ABSENT, "5", who="ann lee")])
+    append_decisions(project.with_name("decisions.jsonl"), [mark_decision(DecisionKind.ABSENT, "5", who="ann lee")])
     (stale,) = json.loads(printed("status", project, "--json", code=1))["images"].values()
     assert (stale["verdict"], "not applied yet" in stale["why"]) == ("old", True)
     assert command("measure", project) == 0

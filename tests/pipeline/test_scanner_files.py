@@ -24,8 +24,8 @@ from pipeline.report.camera_views import bend_field
 from pipeline.results.adjustment_file import read_covariance
 from synthetic_images.film import frame_geometry, scanner_bend
 from synthetic_images.render import render_scene
-from synthetic_images.scene import Film, Scene, SceneCamera, SceneFiducial, SceneImage, TakingLens, Tones
-from synthetic_images.scene import Scanner as SceneScanner
+from synthetic_images.scene import Scene, SceneCamera, SceneFiducial, SceneFilm, SceneImage, SceneTakingLens, Tones
+from synthetic_images.scene import SceneScanner as SceneScanner
 
 TEMPLATE = (files("pipeline") / "templates" / "scene.toml").read_text()
 TRUTH = {"a20": 0.02, "b11": -0.015, "b02": 0.01}
@@ -116,7 +116,7 @@ Array = NDArray[np.float64]
 
 PITCH_UM = 30.0
 PLACES = {str(3 * i + j): (18.0 * (i - 1), 18.0 * (j - 1)) for i in range(3) for j in range(3) if (i, j) != (1, 1)}
-LENS = TakingLens(1900.0, (770.0, 760.0), k1=-0.12, k2=0.04, p1=5e-4)
+LENS = SceneTakingLens(1900.0, (770.0, 760.0), k1=-0.12, k2=0.04, p1=5e-4)
 MATRIX = np.array([[1900.0, 0.0, 770.0], [0.0, 1900.0, 760.0], [0.0, 0.0, 1.0]])
 COEFFICIENTS = np.array([-0.12, 0.04, 5e-4, 0.0, 0.0])
 CAMERA = """name = "K"
@@ -128,10 +128,10 @@ Photograph = tuple[Path, dict[str, Array]]  # a folder, and where the marks of i
 PX = np.random.default_rng(2).uniform(0.0, 1530.0, (30, 2))
 
 
-def photographed_scene(tilt_deg: float, lens: TakingLens) -> Scene:
+def photographed_scene(tilt_deg: float, lens: SceneTakingLens) -> Scene:
     fiducials = tuple(SceneFiducial(id, xy, CROSS) for id, xy in PLACES.items())
     camera = SceneCamera("K", (40.0, 40.0), 60.0, fiducials=fiducials)
-    film = Film("projective", tilt_deg=tilt_deg, tilt_direction_deg=25.0, photographed_from_mm=110.0)
+    film = SceneFilm("projective", tilt_deg=tilt_deg, tilt_direction_deg=25.0, photographed_from_mm=110.0)
     scanner = SceneScanner((PITCH_UM, PITCH_UM), margin_mm=3.0, noise=0.01, lens=lens)
     image = SceneImage("a", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0))
     return Scene("photo", 3, camera, hidden_field(), (image,), scanner, film, Tones(contrast=0.0))

@@ -31,21 +31,21 @@ from pipeline.resampling.canvas import FrameChain
 from pipeline.resampling.resample_stage import FAST, FrameScan, ResampleTask, resampled
 from pipeline.results.comparator_file import ComparatorPoint, read_comparator, write_comparator
 from synthetic_images.render import render_scene
-from synthetic_images.scene import DiskField, Distortion, Film, Scanner, Scene, SceneCamera, SceneImage
+from synthetic_images.scene import DiskField, Scene, SceneCamera, SceneDistortion, SceneFilm, SceneImage, SceneScanner
 from synthetic_images.terrain import transferred
 
 SCENE = Scene(
     name="crosswise",
     seed=3,
-    camera=SceneCamera("c", (38.0, 38.0), 35.0, (0.02, -0.03), Distortion("torlegard", {"k3": 3e-6})),
+    camera=SceneCamera("c", (38.0, 38.0), 35.0, (0.02, -0.03), SceneDistortion("torlegard", {"k3": 3e-6})),
     field=DiskField((), 1.0),
     images=(
         SceneImage("a", (-130.0, 3.0, 600.0, 0.004, -0.005, 0.007)),
         SceneImage("b", (130.0, -5.0, 605.0, -0.005, 0.002, -0.01), pose="180"),
         SceneImage("c", (-65.0, 6.0, 595.0, 0.002, 0.007, 1.58), pose="90m"),
     ),
-    scanner=Scanner((80.0, 80.0), margin_mm=1.0, noise=0.004),
-    film=Film(grain=0.008, grain_px=0.6, deformation_um=5.0),
+    scanner=SceneScanner((80.0, 80.0), margin_mm=1.0, noise=0.004),
+    film=SceneFilm(grain=0.008, grain_px=0.6, deformation_um=5.0),
     background="terrain",
     relief=2.3,
 )
@@ -154,7 +154,10 @@ def mapped(noise_px: float = 0.0) -> block_stage.Mapped:
     view = [lattice_px(projects.camera_mm(i)) + rng.normal(0.0, noise_px, (100, 2)) for i in projects.IMAGES]
     off = float(noise_px * np.sqrt(2.0 * (8 - 3) / 8))  # of eight coordinates three went into the point
     tracks = {
-        j: [block_stage.Sight(f"f{i}", float(view[i][j, 0]), float(view[i][j, 1]), 4.0, off) for i in projects.IMAGES]
+        j: [
+            block_stage.TrackObservation(f"f{i}", float(view[i][j, 0]), float(view[i][j, 1]), 4.0, off)
+            for i in projects.IMAGES
+        ]
         for j in range(100)
     }
     return block_stage.Mapped(poses, tracks)
@@ -220,7 +223,9 @@ def test_their_standard_deviation_is_that_of_features_of_their_size() -> None:
         noise = sigmas * rng.normal(size=2 * sights) * (30.0 if number % 30 == 0 else 1.0)
         left = noise - design @ (design.T @ noise)
         offs = np.hypot(*left.reshape(-1, 2).T)
-        tracks[number] = [block_stage.Sight(f"f{i}", 1.0, 1.0, float(sizes[i]), float(offs[i])) for i in range(sights)]
+        tracks[number] = [
+            block_stage.TrackObservation(f"f{i}", 1.0, 1.0, float(sizes[i]), float(offs[i])) for i in range(sights)
+        ]
     precision = block_stage.feature_precision(replace(mapped(), tracks=tracks))
     for size_px in (4.0, 7.0, 11.0):
         assert precision.sigma_px(size_px) == pytest.approx(np.hypot(0.5, 0.12 * size_px), rel=0.04)
@@ -235,7 +240,7 @@ def test_ties_are_spread_and_wrong_ones_left_out() -> None:
     assert LATTICE.width_px / block_stage.CELLS > 100
     wrong = {**block.tracks, 7: [replace(sight, off_px=4.0) for sight in block.tracks[7]]}
     assert "tie-7" not in {mark.point for mark in block_stage.tie_marks(replace(block, tracks=wrong), PICTURES)}
-    twice = {**block.tracks, 8: [*block.tracks[8], block_stage.Sight("f0", 5.0, 5.0, 4.0, 0.5)]}
+    twice = {**block.tracks, 8: [*block.tracks[8], block_stage.TrackObservation("f0", 5.0, 5.0, 4.0, 0.5)]}
     assert "tie-8" not in {mark.point for mark in block_stage.tie_marks(replace(block, tracks=twice), PICTURES)}
 
 

@@ -24,7 +24,7 @@ CAMERA = scenes.SceneCamera(
     (12.0, 12.0),
     14.0,
     (0.05, -0.04),
-    scenes.Distortion("torlegard", {"k3": -2.0e-4, "p1": 3.0e-5}),
+    scenes.SceneDistortion("torlegard", {"k3": -2.0e-4, "p1": 3.0e-5}),
     tuple(scenes.SceneFiducial(id, xy, CROSS) for id, xy in PLACES.items()),
 )
 FIELD = scenes.DiskField(
@@ -37,12 +37,12 @@ FIELD = scenes.DiskField(
     surround=0.0,
 )
 OBLIQUE = scenes.SceneImage("f", (1.2, -0.5, 3.2, 0.16, 0.34, 0.4))
-SCANNER = scenes.Scanner((40.0, 40.0), margin_mm=1.0)
+SCANNER = scenes.SceneScanner((40.0, 40.0), margin_mm=1.0)
 
 
 def scene(**changes: Any) -> scenes.Scene:
     plain = scenes.Scene(
-        "test", 4, CAMERA, FIELD, (OBLIQUE,), SCANNER, scenes.Film(), scenes.Tones(contrast=0.0), pad_mm=1.2
+        "test", 4, CAMERA, FIELD, (OBLIQUE,), SCANNER, scenes.SceneFilm(), scenes.Tones(contrast=0.0), pad_mm=1.2
     )
     return replace(plain, **changes)
 

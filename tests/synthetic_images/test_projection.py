@@ -36,7 +36,7 @@ def test_torlegard_with_literal_decentring_agrees_with_exact_observations() -> N
     reference = case("i_five_images_affine_paper_noisefree")
     truth, given = reference["truth"], reference["input"]
     parameters = {name: truth[f"IO.{name}"] for name in ("k3", "k5", "p1", "p2")}
-    distortion = scenes.Distortion("torlegard", parameters, reference["r0"], "paper")
+    distortion = scenes.SceneDistortion("torlegard", parameters, reference["r0"], "paper")
     camera = scenes.SceneCamera("c", FRAME, truth["IO.c"], (truth["IO.x0"], truth["IO.y0"]), distortion)
     worst = 0.0
     for image, point, x, y, *_ in given["obs"]:
@@ -52,7 +52,7 @@ def test_juhl_leaves_the_noise_of_his_simulated_example() -> None:
     truth, given = reference["truth"], reference["input"]
     parameters = {name: truth[f"IO.{name}"] for name in scenes.PARAMETERS["juhl"]}
     camera = scenes.SceneCamera(
-        "c", FRAME, 150.0, (0.0, 0.0), scenes.Distortion("juhl", parameters, 100.0 * reference["r0"])
+        "c", FRAME, 150.0, (0.0, 0.0), scenes.SceneDistortion("juhl", parameters, 100.0 * reference["r0"])
     )
     misses = []
     for image, point, x, y, *_ in given["obs"]:
@@ -66,7 +66,7 @@ def test_juhl_leaves_the_noise_of_his_simulated_example() -> None:
 def test_opencv_family_is_opencv_in_pixels() -> None:
     """A scan of this camera, pixels of 10 um, is what OpenCV projects with its own axes and camera matrix."""
     parameters = {"k1": -0.11, "k2": 0.05, "p1": 0.0012, "p2": -0.0007, "k3": 0.01, "s1": 2e-3, "s3": -1e-3}
-    camera = scenes.SceneCamera("c", (60.0, 60.0), 52.0, (0.21, -0.34), scenes.Distortion("opencv", parameters))
+    camera = scenes.SceneCamera("c", (60.0, 60.0), 52.0, (0.21, -0.34), scenes.SceneDistortion("opencv", parameters))
     station, angles = np.array([0.4, -0.3, 5.0]), (0.12, -0.2, 2.1)
     points = np.random.default_rng(3).uniform((-1.5, -1.5, -0.5), (1.5, 1.5, 0.5), (40, 3))
     down = np.diag([1.0, -1.0, -1.0])
@@ -81,7 +81,9 @@ def test_opencv_family_is_opencv_in_pixels() -> None:
 
 def test_b1_is_the_difference_of_opencvs_focal_lengths() -> None:
     plain, stretched = (
-        scenes.SceneCamera("c", (60.0, 60.0), 52.0, (0.2, 0.1), scenes.Distortion("opencv", {"k1": -0.1, "b1": b1}))
+        scenes.SceneCamera(
+            "c", (60.0, 60.0), 52.0, (0.2, 0.1), scenes.SceneDistortion("opencv", {"k1": -0.1, "b1": b1})
+        )
         for b1 in (0.0, 0.003)
     )
     points, pose = np.array([[0.3, 0.4, 0.0]]), (0.0, 0.0, 5.0, 0.0, 0.0, 0.0)
@@ -94,7 +96,7 @@ def test_a_purely_radial_correction_is_inverted(family: str) -> None:
     """k r^3 along a radius: the observed radius is the root of r - k r^3 = ideal, here by bisection."""
     k = 2.0e-7
     name = "k3" if family == "torlegard" else "k1"
-    distortion = scenes.Distortion("torlegard" if family == "torlegard" else "brown", {name: k})
+    distortion = scenes.SceneDistortion("torlegard" if family == "torlegard" else "brown", {name: k})
     camera = scenes.SceneCamera("c", FRAME, 150.0, (0.0, 0.0), distortion)
     point = np.array([[0.6, 0.45, 0.0]])  # 3 : 4 : 5, ideal radius 112.5
     radius = np.hypot(*camera_from_object(camera, (0.0, 0.0, 1.0, 0.0, 0.0, 0.0), point)[0])
@@ -122,7 +124,7 @@ def test_points_that_no_lens_images_have_no_place() -> None:
 
 PLACES = np.random.default_rng(1).uniform(-5.5, 5.5, (20, 2))
 CENTER = (170.0, 160.0)
-LENS = scenes.TakingLens(500.0, CENTER, k1=-0.2, k2=0.1, p1=2e-3, p2=-1e-3, k3=0.05)
+LENS = scenes.SceneTakingLens(500.0, CENTER, k1=-0.2, k2=0.1, p1=2e-3, p2=-1e-3, k3=0.05)
 
 
 def test_a_taking_lens_puts_pixels_where_opencv_does_and_gives_them_back() -> None:
@@ -137,11 +139,11 @@ def test_a_taking_lens_puts_pixels_where_opencv_does_and_gives_them_back() -> No
     np.testing.assert_allclose(through.camera_from_scan(pictured), PLACES, atol=1e-6)
 
 
-BROWN = scenes.Distortion("brown", {"k1": 2e-6, "p1": 1e-5})
-OPENCV = scenes.Distortion("opencv", {"k1": -0.1, "k2": 0.02, "p1": 1e-3, "b1": 1e-3})
+BROWN = scenes.SceneDistortion("brown", {"k1": 2e-6, "p1": 1e-5})
+OPENCV = scenes.SceneDistortion("opencv", {"k1": -0.1, "k2": 0.02, "p1": 1e-3, "b1": 1e-3})
 
 
-def crosswise(distortion: scenes.Distortion = BROWN, relief: float = 8.0) -> scenes.Scene:
+def crosswise(distortion: scenes.SceneDistortion = BROWN, relief: float = 8.0) -> scenes.Scene:
     """Two small frames over hilly ground, the second turned and its scan mirrored."""
     film = scenes.FilmTransformation(scale=(1.0003, 0.9996), shear_rad=1e-4)
     return scenes.Scene(
@@ -153,16 +155,16 @@ def crosswise(distortion: scenes.Distortion = BROWN, relief: float = 8.0) -> sce
             scenes.SceneImage("a", (-20.0, 0.0, 300.0, 0.02, -0.03, 0.01), film=film),
             scenes.SceneImage("b", (30.0, 10.0, 310.0, -0.02, 0.04, 1.6), pose="90m", film=film),
         ),
-        scanner=scenes.Scanner((100.0, 100.0)),
-        film=scenes.Film(deformation_um=20.0),
+        scanner=scenes.SceneScanner((100.0, 100.0)),
+        film=scenes.SceneFilm(deformation_um=20.0),
         background="terrain",
         ground=15.0,
         relief=relief,
     )
 
 
-@pytest.mark.parametrize("distortion", [BROWN, OPENCV, scenes.Distortion()])
-def test_rays_lead_to_terrain_that_is_visible_at_the_same_pixel(distortion: scenes.Distortion) -> None:
+@pytest.mark.parametrize("distortion", [BROWN, OPENCV, scenes.SceneDistortion()])
+def test_rays_lead_to_terrain_that_is_visible_at_the_same_pixel(distortion: scenes.SceneDistortion) -> None:
     scene = crosswise(distortion)
     geometry = frame_geometry(scene, 1)
     pixels = np.random.default_rng(1).uniform(60.0, 440.0, (50, 2))

@@ -42,7 +42,7 @@ def test_disks_lie_where_the_truth_says(tmp_path: Path) -> None:
     """Oblique, distorted and on a film that has moved: the centre of the ellipse, not the projected centre."""
     film = scenes.FilmTransformation((1.002, 0.999), 3e-4, 0.01, (0.02, -0.03))
     made = scene(
-        images=(replace(OBLIQUE, film=film, pose="270m", turn_rad=0.01),), film=scenes.Film(deformation_um=4.0)
+        images=(replace(OBLIQUE, film=film, pose="270m", turn_rad=0.01),), film=scenes.SceneFilm(deformation_um=4.0)
     )
     picture, truth = rendered(tmp_path, made)
     targets = truth.frames[0].targets
@@ -107,7 +107,7 @@ def test_what_cannot_be_visible_is_stated(tmp_path: Path) -> None:
         scenes.DiskTarget("above", (0.0, 0.0, 9.0)),
     )
     made = scene(
-        camera=replace(camera, distortion=scenes.Distortion()),
+        camera=replace(camera, distortion=scenes.SceneDistortion()),
         field=scenes.DiskField(targets, 0.12),
         images=(scenes.SceneImage("f", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0), covered=("b",)),),
         pad_mm=0.0,
@@ -146,7 +146,7 @@ def test_a_neighbours_marks_stand_a_frame_further(tmp_path: Path) -> None:
 
 def test_a_chessboards_corners_are_points_of_symmetry(tmp_path: Path) -> None:
     board = scenes.BoardField("chessboard", 3, 2, 0.5)
-    camera = replace(CAMERA, distortion=scenes.Distortion(), principal_point_mm=(0.0, 0.0), fiducials=())
+    camera = replace(CAMERA, distortion=scenes.SceneDistortion(), principal_point_mm=(0.0, 0.0), fiducials=())
     image = scenes.SceneImage("f", (0.5, 0.5, 3.5, 0.0, 0.0, 0.0))
     picture, truth = rendered(tmp_path, scene(field=board, camera=camera, images=(image,)))
     corner = truth.frames[0].targets["r0c1"].center_px
@@ -170,7 +170,7 @@ def test_circle_grids_hold_their_dots(tmp_path: Path, asymmetric: bool, dots: in
 
 def test_a_disk_is_no_smaller_than_it_should_be(tmp_path: Path) -> None:
     """Seen upright from 3 m with c = 14 mm, a disk of 0.12 m has pi (0.06 / 3 * 14 / 0.04)^2 px."""
-    camera = replace(CAMERA, distortion=scenes.Distortion(), fiducials=())
+    camera = replace(CAMERA, distortion=scenes.SceneDistortion(), fiducials=())
     field = scenes.DiskField((scenes.DiskTarget("1", (0.1, 0.2, 0.0)),), 0.12, surround=0.0)
     image = scenes.SceneImage("f", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0))
     tones = scenes.Tones(background=0.2, target=0.8, contrast=0.0)
@@ -190,7 +190,7 @@ def test_a_polygonised_disk_is_a_disk() -> None:
 def test_eccentricity_follows_the_closed_form() -> None:
     """The ellipse's centre less the projected centre, from the dual conic, with centre c and normal n in the camera's
     frame, z forwards, y down: f r^2 [n_xy n_z + c_xy / c_z (1 - n_z^2)] / (c_z^2 - r^2 (1 - n_z^2))."""
-    camera = replace(CAMERA, distortion=scenes.Distortion(), principal_point_mm=(0.0, 0.0))
+    camera = replace(CAMERA, distortion=scenes.SceneDistortion(), principal_point_mm=(0.0, 0.0))
     frame = frame_truth(scene(camera=camera), 0)
     into_camera = np.diag([1.0, -1.0, -1.0]) @ object_rotation(*OBLIQUE.exterior[3:])
     radius = FIELD.diameter / 2
@@ -207,7 +207,7 @@ def test_light_reaches_pockets_next_to_the_frame_and_nowhere_twice(tmp_path: Pat
     """Of a mark 0.5 mm beyond the frame's edge: its pocket reaches 0.3 mm into the frame."""
     fiducials = (scenes.SceneFiducial("e", (6.5, 0.0), None),)
     image = scenes.SceneImage("f", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0))
-    camera = replace(CAMERA, fiducials=fiducials, distortion=scenes.Distortion())
+    camera = replace(CAMERA, fiducials=fiducials, distortion=scenes.SceneDistortion())
     clean = replace(SCANNER, margin_mm=2.0, noise=0.0)
     made = scene(camera=camera, field=hidden_field(), images=(image,), scanner=clean, pad_mm=0.0, pocket_mm=0.8)
     grey, truth = rendered(tmp_path, made)
@@ -363,7 +363,7 @@ def test_a_term_that_there_is_not_is_refused() -> None:
 def test_film_photographed_by_a_tilted_camera_is_visible_as_a_pinhole_sees_it(tmp_path: Path, pose: str) -> None:
     """The film's points turned about an axis in it and projected, by the collinearity of a pinhole 80 mm away."""
     image = replace(OBLIQUE, pose=pose)
-    film = scenes.Film("projective", tilt_deg=8.0, tilt_direction_deg=30.0, photographed_from_mm=80.0)
+    film = scenes.SceneFilm("projective", tilt_deg=8.0, tilt_direction_deg=30.0, photographed_from_mm=80.0)
     _, truth = rendered(tmp_path, scene(images=(image,), film=film))
     flat = frame_geometry(scene(images=(image,)), 0)
     axis = np.array([-np.sin(np.deg2rad(30.0)), np.cos(np.deg2rad(30.0)), 0.0])
@@ -382,4 +382,4 @@ def test_film_photographed_by_a_tilted_camera_is_visible_as_a_pinhole_sees_it(tm
 
 def test_film_that_a_tilted_camera_photographed_is_projective() -> None:
     with pytest.raises(ValueError, match="projective"):
-        scenes.Film("affine", tilt_deg=2.0)
+        scenes.SceneFilm("affine", tilt_deg=2.0)

@@ -14,7 +14,7 @@ from small_scene import CAMERA, SCANNER, hidden_field, rendered, scene
 import synthetic_images
 from synthetic_images.areas import rounded_rectangle
 from synthetic_images.render import STRIP_PX, render_scene
-from synthetic_images.scene import Compression, DrawnMark, Film, SceneFiducial, Tones
+from synthetic_images.scene import Compression, DrawnMark, SceneFiducial, SceneFilm, Tones
 from synthetic_images.tiff import Grey, write_tiff
 
 
@@ -78,7 +78,7 @@ def test_white_is_zero_changes_the_file_and_not_the_picture(tmp_path: Path) -> N
 def test_grain_and_noise_have_the_strength_and_the_correlation_requested(tmp_path: Path) -> None:
     sigma = 1.2
     made = scene(
-        film=Film(grain=0.03, grain_px=sigma),
+        film=SceneFilm(grain=0.03, grain_px=sigma),
         scanner=replace(SCANNER, noise=0.01, margin_mm=5.0, blur_px=0.0),
         field=hidden_field(),
         camera=replace(CAMERA, fiducials=()),
@@ -116,7 +116,7 @@ def test_the_border_and_what_was_not_exposed_within_the_frame_have_one_texture(t
 
 @pytest.mark.study
 def test_the_same_scene_gives_the_same_bytes_and_another_seed_others(tmp_path: Path) -> None:
-    film = Film(grain=0.02, dust=5, scratches=1, hairs=1)
+    film = SceneFilm(grain=0.02, dust=5, scratches=1, hairs=1)
     made = scene(film=film, background="terrain", tones=Tones())
     for name, one in (("a", made), ("b", made), ("c", replace(made, seed=5))):
         render_scene(one, tmp_path / name)
@@ -131,7 +131,7 @@ def test_memory_does_not_grow_with_the_scans_length(tmp_path: Path) -> None:
     peaks = []
     for height_mm in (40.0, 160.0):
         camera = replace(CAMERA, frame_mm=(40.0, height_mm), fiducials=())
-        made = scene(camera=camera, film=Film(grain=0.02), field=hidden_field())
+        made = scene(camera=camera, film=SceneFilm(grain=0.02), field=hidden_field())
         tracemalloc.start()
         render_scene(made, tmp_path)
         peaks.append(tracemalloc.get_traced_memory()[1])
