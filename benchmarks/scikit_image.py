@@ -25,7 +25,7 @@ from true_marks import KIND, TrueMark, some_mark
 from adjust.functional_model.transformation import film_kind, fit_transformation
 from benchmarks.harness import Row, rms
 from benchmarks.measured_marks import CONTRAST, GROUND, draw_mark, measure_mark, start_off
-from measure.boards.corners import junctions
+from measure.boards.corner_fit import junctions
 from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
 from measure.noise.robust_estimation import _opened, robust_scale
 from measure.targets.detection import DiskSearch, disk_candidates

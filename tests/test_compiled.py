@@ -16,8 +16,8 @@ from adjust.linear_algebra import elimination, fronts
 from adjust.linear_algebra.elimination import SparseBlocks, eliminated
 from adjust.linear_algebra.factor import Blocks
 from adjust.linear_algebra.fronts import Fronts
+from adjust.linear_algebra.normal_equations import SharedEquations, SparseRows, SparsityPattern
 from adjust.linear_algebra.sparse_factor import Triangle
-from adjust.linear_algebra.sparse_rows import SharedEquations, SparseRows, SparsityPattern
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
 from pipeline.cli import DONE, run

@@ -1,5 +1,8 @@
 """Observation equations of an adjustment: numbering of the free unknowns, blocks of observations, weighted rows.
 
+`linear_algebra.elimination` reduces the rows to the shared unknowns, by Householder transformations or by the normal
+equations of `linear_algebra.normal_equations`.
+
 Rows are whitened condition equations F1, F2 and F3, F4 in blocks, and priors of unknowns.
 """
 
@@ -14,8 +17,8 @@ import compiled
 from adjust.array_types import Array, Indices
 from adjust.linear_algebra.factor import Blocks
 from adjust.linear_algebra.fronts import Fronts, band_order, make_fronts
+from adjust.linear_algebra.normal_equations import SparseRows, SparsityPattern
 from adjust.linear_algebra.small_matrices import applied, inverse, lower_root, product
-from adjust.linear_algebra.sparse_rows import SparseRows, SparsityPattern
 from adjust.problem.condition_equations import Derivatives
 from adjust.problem.problem import ABSENT, Problem, State, side_by_side
 

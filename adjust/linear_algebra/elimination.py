@@ -26,6 +26,7 @@ import compiled
 from adjust.array_types import Array, Indices
 from adjust.linear_algebra.factor import BlockFactors, Blocks, DenseBlocks, Factor, column_values
 from adjust.linear_algebra.fronts import Fronts
+from adjust.linear_algebra.normal_equations import SharedEquations, SparseRows, SparsityPattern, batches, take_columns
 from adjust.linear_algebra.sparse_factor import (
     TEN_DIGITS,
     Triangle,
@@ -34,7 +35,6 @@ from adjust.linear_algebra.sparse_factor import (
     reflected,
     reflections_cost,
 )
-from adjust.linear_algebra.sparse_rows import SharedEquations, SparseRows, SparsityPattern, batches, take_columns
 
 COMPILED_OWN = 3  # largest number of own unknowns per block in kernels.c
 CHEAP = 1e7  # rows times columns squared of the shared unknowns, up to which Householder QR is always used

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from measure.array_types import Array
-from measure.boards.corners import Corner
+from measure.boards.corner_fit import Corner
 from measure.boards.specs import FoundCorner, Point3
 from measure.flags import Cause
 from measure.matching.models import PIXEL_VARIANCE_PX2

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from measure.array_types import Array
-from measure.boards.corners import Corner, CornerStart, Surface, crossing, fit_corners, quarter
+from measure.boards.corner_fit import Corner, CornerStart, Surface, crossing, fit_corners, quarter
 from measure.boards.edge_shift import without_edge_shift
 from measure.boards.find import find_board
 from measure.boards.lattice import Place, find_grid, grid_size

@@ -1,4 +1,4 @@
-"""Tone curve by which a scanner or converter stores light as grey values (codes).
+"""Tone curve by which a scanner or converter stores light as grey values (codes), and its estimate from images.
 
 Film, lens and scanner blur the light before it is coded. A fit in linear light needs the curve from code to light, up
 to gain and offset, which every fit estimates. A curve is therefore described by the logarithm of its slope, up to a

@@ -14,7 +14,7 @@ from pipeline.design.setup import Setup, scene_setup
 from pipeline.errors import InputError
 from pipeline.rendered.scene_file import parse_scene
 from pipeline.rendered.scene_tables import Sweep
-from pipeline.text.tables import Table, read_toml
+from pipeline.text.toml_tables import Table, read_toml
 from pipeline.text.wording import did_you_mean
 
 Values = dict[str, Any]

@@ -27,7 +27,7 @@ from pipeline.exchange.incoming import ImportOptions, Incoming
 from pipeline.files.camera_file import CameraFile, GivenFiducial, fiducial_distances
 from pipeline.files.camera_tables import DEFAULT_SIGMA_MM, FiducialDistanceTable, FiducialTable
 from pipeline.text.table_models import Key, Positive, WrongKey, numbers, read_model, table_model
-from pipeline.text.tables import read_toml
+from pipeline.text.toml_tables import read_toml
 from pipeline.types import Array
 
 CERTIFICATE = Convention(

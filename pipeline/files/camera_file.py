@@ -21,7 +21,7 @@ from pipeline.files.earlier_calibration import EarlierCalibration, read_calibrat
 from pipeline.files.mark_table import Clicks, Drawing, LearnedFrom, SavePicture, read_marks, template_values
 from pipeline.text.files import SMALLEST_SIGMA, FilePath, image_name
 from pipeline.text.table_models import read_model
-from pipeline.text.tables import Table, list_words, read_toml
+from pipeline.text.toml_tables import Table, list_words, read_toml
 from pipeline.text.wording import did_you_mean, table_lines
 
 FIELD_RATIO = 50.0  # largest half diagonal over principal distance, or frame over fiducials' extent: 178° field of view

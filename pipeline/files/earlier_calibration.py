@@ -15,7 +15,7 @@ from adjust.problem.parameter import Parameter
 from pipeline.files.camera_tables import SigmaTable
 from pipeline.results.adjustment_file import ParameterCovariance, covariance_path, read_adjustment, read_covariance
 from pipeline.results.adjustment_record import CameraRecord, DistortionRecord
-from pipeline.text.tables import Table
+from pipeline.text.toml_tables import Table
 from pipeline.types import Array
 
 INTERIOR = ("c", "x0", "y0")

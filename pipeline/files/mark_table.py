@@ -17,7 +17,7 @@ from measure.marks import shapes
 from measure.marks.shapes import MarkTemplate, Point
 from pipeline.text import table_models as models
 from pipeline.text.files import write_atomically
-from pipeline.text.tables import Table
+from pipeline.text.toml_tables import Table
 from pipeline.types import Array
 
 Picture = NDArray[np.uint16]

@@ -26,7 +26,7 @@ from pipeline.provenance import hash_content
 from pipeline.results.adjustment_file import covariance_path
 from pipeline.text.files import FilePath, no_such_file, path_below
 from pipeline.text.table_models import read_model
-from pipeline.text.tables import Table, read_toml
+from pipeline.text.toml_tables import Table, read_toml
 from pipeline.text.wording import nearest
 
 if TYPE_CHECKING:

@@ -1,4 +1,7 @@
-"""Tables of project.toml, among them [adjust], and all keys for the documentation."""
+"""Tables of project.toml, among them [adjust], and all keys for the documentation.
+
+Keys are checked by `pipeline.text.table_models.read_model`.
+"""
 
 import itertools
 import math

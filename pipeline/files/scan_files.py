@@ -13,7 +13,7 @@ from measure.scans.remote import find_addresses, is_address, part_text, public_t
 from pipeline.errors import InputError
 from pipeline.files.object_files import GivenImages
 from pipeline.text.files import names_below
-from pipeline.text.tables import Table
+from pipeline.text.toml_tables import Table
 
 _ANY_DEPTH = "**"
 Named = str | Path  # a file as text, which is fast; an address as an object, which caches what its store reported

@@ -10,7 +10,7 @@ from measure.marks.shapes import Polarity
 from measure.targets.ring_codes import RingCode
 from measure.tie_points.find_points import TieOptions
 from pipeline.text.table_models import NotNegative, Positive, WrongKey, read_kind, table_model, whole
-from pipeline.text.tables import Table
+from pipeline.text.toml_tables import Table
 
 _MOST_OF_A_BOARD = 500  # limit of columns and of rows
 _Count = Annotated[int, whole(1, _MOST_OF_A_BOARD)]

@@ -17,7 +17,7 @@ from pipeline.rendered.scene_project import Given, SceneFile, write_project
 from pipeline.rendered.scene_tables import DesignSettings, read_field
 from pipeline.text import table_models as models
 from pipeline.text.files import make_folder, quote_value
-from pipeline.text.tables import Table, read_toml
+from pipeline.text.toml_tables import Table, read_toml
 from synthetic_images import areas, scene
 from synthetic_images.render import Progress, render_scene
 

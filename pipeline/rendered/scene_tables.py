@@ -13,7 +13,7 @@ from measure.targets.ring_codes import RingCode
 from pipeline.files.project_tables import UNITS_MM, Datum, Film, ScannerSetting, ScannerSigma, scanner_setting
 from pipeline.text import table_models as models
 from pipeline.text.table_models import number, numbers
-from pipeline.text.tables import Table
+from pipeline.text.toml_tables import Table
 from pipeline.types import Array
 from synthetic_images.scene import BoardField, CrossFigure, DiskField, DiskTarget, RingFigure
 

@@ -22,7 +22,7 @@ from adjust.problem.parameter import Parameter, parameter_from_text
 from pipeline.errors import InputError
 from pipeline.text.files import parse_json, quote_value, read_bytes, write_atomically
 from pipeline.text.table_models import MANY_KEYS, name_in_file
-from pipeline.text.tables import list_words
+from pipeline.text.toml_tables import list_words
 from pipeline.text.wording import LISTED
 
 Record = TypeVar("Record")

@@ -22,7 +22,7 @@ from pipeline.files.mark_table import picture_writer, template_values
 from pipeline.measuring.first_pictures import fit_clicks
 from pipeline.review.requests import parse_values
 from pipeline.text.files import write_atomically
-from pipeline.text.tables import Table
+from pipeline.text.toml_tables import Table
 from pipeline.text.wording import listed, table_lines
 from pipeline.types import Array
 

@@ -32,7 +32,7 @@ from pydantic.fields import FieldInfo
 
 from pipeline.errors import InputError
 from pipeline.text.files import LARGEST, quote_value
-from pipeline.text.tables import Table, list_words
+from pipeline.text.toml_tables import Table, list_words
 from pipeline.text.wording import LISTED, did_you_mean, nearest
 
 Model = TypeVar("Model")

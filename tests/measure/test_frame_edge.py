@@ -16,7 +16,7 @@ from studies import parametrize_with_studies
 
 from measure import FiducialOptions, MarkFit, ScanWindow, Status, measure_fiducials
 from measure.array_types import Single
-from measure.boards.corners import Corner, CornerStart, Surface, crossing, fit_corners, quarter
+from measure.boards.corner_fit import Corner, CornerStart, Surface, crossing, fit_corners, quarter
 from measure.marks import shapes
 from measure.matching.frame_edge import fit_frame_corner
 from measure.scans.jpeg import rounding_step_dn

@@ -43,7 +43,7 @@ from pipeline.opencv_check.check import BoardPictures, compare_corners, detector
 from pipeline.opencv_check.opencv_calibration import NAMES, Freedom, OpenCvCalibration, OpenCVPoints, calibrate
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.measured_record import MeasuredScan
-from pipeline.text.tables import Table
+from pipeline.text.toml_tables import Table
 
 Array = NDArray[np.float64]
 

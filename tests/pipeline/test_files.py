@@ -23,7 +23,7 @@ from pipeline.files.project_file import Project, read_project
 from pipeline.rendered.scene_file import read_scene
 from pipeline.results.comparator_file import read_comparator, write_comparator
 from pipeline.text.files import check_writable, write_atomically
-from pipeline.text.tables import read_toml
+from pipeline.text.toml_tables import read_toml
 
 CAMERA = """
 name = "C"

@@ -41,7 +41,7 @@ from pipeline.measuring.scan_measurement import ended_scan, measured_scan
 from pipeline.measuring.scan_task import ScanTask, sample_names, scan_tasks
 from pipeline.provenance import file_state, parts_hash
 from pipeline.results import measured_record
-from pipeline.text.tables import Table
+from pipeline.text.toml_tables import Table
 from pipeline.workers import iterate_results
 
 BOARD = '[targets]\nkind = "chessboard"\ncolumns = 5\nrows = 4\nsquare_mm = 10.0\n'

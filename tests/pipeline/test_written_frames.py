@@ -27,7 +27,7 @@ from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import render_project
 from pipeline.report.frame_views import writing_picture
 from pipeline.results.measured_record import MeasuredScan, for_images, write_frames
-from pipeline.text.tables import Table
+from pipeline.text.toml_tables import Table
 
 WILD = (WrittenPlace("left", "90"), WrittenPlace("right", "270", plate=True))
 TITLES = ("RUN 7", "8601-8639", "16.5.68", "14,000'", "8617", "AUSTRALIAN")

@@ -15,7 +15,7 @@ from studies import parametrize_with_studies
 
 from pipeline.errors import InputError
 from pipeline.rendered.scene_file import parse_scene
-from pipeline.text.tables import Table
+from pipeline.text.toml_tables import Table
 from synthetic_images import scene as scenes
 from synthetic_images.areas import coverage, disk
 from synthetic_images.film import frame_geometry

@@ -1,4 +1,4 @@
-"""TOML files, and their tables with the places of keys for messages."""
+"""TOML files: their tables, the places of keys for messages, and unknown keys with "did you mean"."""
 
 import re
 import shlex
