@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import cv2
@@ -20,6 +20,7 @@ _STEP_TOLERANCE = 0.3  # in steps, between expected and actual place of a neighb
 _SEEDS = 12  # start points, spread over all points
 _LIKENESS = 0.4  # largest difference of neighbours in log size and log contrast
 _LEAST_SHARE = 0.8  # fraction of the grid's places that must be detected
+_LINE_SHARE = 0.5  # fraction of a line's places from which on the line is one of the grid
 _BLOCKS = (1 / 4, 1 / 8, 1 / 16)  # fractions of the image's shorter side: windows of the adaptive threshold
 _DARKER = 12  # grey values of 255 by which a square is darker than the mean around it
 _SMALLEST_SIDE_PX = 6.0  # px; the corners of smaller squares cannot be resolved
@@ -44,8 +45,12 @@ def grid_places(points_px: Array, appearances: Array, places: list[Place]) -> li
     are turned grids, or other positions on a larger lattice, that explain as many up to half a line of the grid. A
     lattice as large as the grid has priority over a larger one.
     """
+    return _best_outlines(_lattices(points_px, appearances), places)
+
+
+def _best_outlines(lattices: list[dict[Place, int]], places: list[Place]) -> list[dict[Place, int]]:
     best: list[dict[Place, int]] = []
-    for lattice in _lattices(points_px, appearances):
+    for lattice in lattices:
         found = _outlines(lattice, places)
         best = max(best, found, key=lambda ways: (is_whole(ways), len(ways[0]) if ways else 0))
         if is_whole(best) and len(best[0]) > 0.98 * len(places):
@@ -159,30 +164,66 @@ def _outline_shifts(columns_rows: Integers, places: list[Place]) -> list[Integer
     return [-least - np.array(spare) for spare in product(range(int(extra[0]) + 1), range(int(extra[1]) + 1))]
 
 
+def _whole_counts(lattice: dict[Place, int], is_staggered: bool) -> list[tuple[int, int]]:
+    """(columns, rows) of the grid that a lattice fills best, without sparse lines at its sides; in both directions."""
+    nodes, scores = np.array(list(lattice)).reshape(-1, 2), dict[tuple[int, int], float]()
+    for matrix in _unit_steps([(0, 0), (1, 1)] if is_staggered else [(0, 0), (0, 1)]):
+        at, is_sparse = nodes @ matrix, True
+        while len(at) and is_sparse:
+            low, high = at.min(axis=0), at.max(axis=0)
+            per_line = (high - low + 1)[::-1] / (2 if is_staggered else 1)
+            ends = [(axis, end[axis]) for end in (low, high) for axis in (0, 1)]
+            sparse = [(axis, end) for axis, end in ends if (at[:, axis] == end).sum() < _LINE_SHARE * per_line[axis]]
+            is_sparse = bool(sparse)
+            for axis, end in sparse[:1]:
+                at = at[at[:, axis] != end]
+        if not len(at):
+            continue
+        columns, rows = (high - low + 1).tolist()
+        begins = not is_staggered or (at - low).sum(axis=1)[0] % 2 == 0  # with a dot
+        places = (columns * rows + 1) // 2 if is_staggered else columns * rows
+        if begins and len(at) > _LEAST_SHARE * places:
+            scores[columns, rows] = len(at) ** 2 / places
+    return [count for count, score in scores.items() if score == max(scores.values())]
+
+
 @dataclass(frozen=True, eq=False)
 class FoundGrid:
     """Grid found in a scan.
 
     assignment: index of the point at each place, empty if no grid was found; others_px: centres of further grids;
-    notes: messages to the user; reason: why no grid was found.
+    notes: messages to the user; reason: why no grid was found; is_larger: since the scan shows one of a larger count.
     """
 
     assignment: dict[Place, int]
     others_px: tuple[Array, ...] = ()
     notes: tuple[str, ...] = ()
     reason: Reason = NO_REASON
+    is_larger: bool = False
 
 
 def find_grid(points_px: Array, appearances: Array, spec: CircleGridSpec | SquareGridSpec, what: str) -> FoundGrid:
     """Find the grid formed by points. Of several orientations the most upright one in the scan is returned.
     points_px, appearances: as in `grid_places`; what: word for the points in messages."""
     size, places = grid_size(spec, what), spec.places()
-    assignments = grid_places(points_px, appearances, places)
-    if not is_whole(assignments):
+    lattices = _lattices(points_px, appearances)
+    assignments = _best_outlines(lattices, places)
+    is_staggered = isinstance(spec, CircleGridSpec) and spec.asymmetric
+    counts = _whole_counts(lattices[0], is_staggered) if lattices else []
+    counts = [count for count in counts if min(count) >= spec.fewest]
+    is_larger = any(columns * rows > spec.columns * spec.rows for columns, rows in counts)
+    if is_larger or not is_whole(assignments):
         message = f"no grid of {size} is whole in the scan; {len(points_px)} spots are candidates for {what}"
-        if assignments:
+        if counts and (spec.columns, spec.rows) not in counts:
+            off = [abs(columns - spec.columns) + abs(rows - spec.rows) for columns, rows in counts]
+            columns, rows = counts[int(np.argmin(off))]
+            other = grid_size(replace(spec, columns=columns, rows=rows), what)
+            message = f"no grid of {size} is whole in the scan; one of {other} is. Set columns and rows to its count"
+            if not is_larger:
+                message += ", or show the whole grid, with all of its lines"
+        elif assignments:
             message = f"the grid is larger than {size}, or one of its lines is hidden"
-        return FoundGrid({}, reason=Reason(message, Code.NO_BOARD))
+        return FoundGrid({}, reason=Reason(message, Code.NO_BOARD), is_larger=is_larger)
 
     def uprightness(assignment: dict[Place, int]) -> float:
         """Covariance of the grid's columns with the column in the scan: largest for the upright grid."""
@@ -204,7 +245,8 @@ def find_grid(points_px: Array, appearances: Array, spec: CircleGridSpec | Squar
 def grid_size(spec: CircleGridSpec | SquareGridSpec, what: str) -> str:
     """Size of a grid for messages. what: word for its points."""
     if isinstance(spec, CircleGridSpec) and spec.asymmetric:  # its columns may be counted as dots or as places
-        return f"{len(spec.places())} {what} in {spec.rows} rows"
+        in_rows = f"{(spec.columns + 1) // 2}{f' and {spec.columns // 2}' if spec.columns % 2 else ''}"
+        return f"{len(spec.places())} {what} in {spec.rows} rows of {in_rows}"
     return f"{spec.columns} x {spec.rows} {what}"
 
 
@@ -218,6 +260,8 @@ def find_squares(picture: Bytes, spec: SquareGridSpec) -> FoundBoard:
         appearances = np.log([[cv2.contourArea(quad.astype(np.float32))] for quad in quads] or np.ones((0, 1)))
         grid = find_grid(centers, appearances, spec, "squares")
         reason = grid.reason
+        if grid.is_larger:  # other thresholds may lose its lines
+            break
         if not reason:
             corners = _square_corners(quads, centers, grid.assignment, spec)
             return FoundBoard(corners, others_px=grid.others_px, notes=grid.notes)

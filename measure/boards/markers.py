@@ -30,6 +30,7 @@ _OFF_SQUARES = 0.25  # in squares, largest distance of a corner from the place g
 _COMMON_DICTIONARIES = ("4X4_250", "5X5_250", "6X6_250", "7X7_250", "ARUCO_ORIGINAL", "APRILTAG_36h11")
 _FEWEST_TWICE = 2  # markers read at several places, from which on these are another board, no false readings
 _FEWEST_CORNERS = 4  # points needed for a homography
+_MOST_COLUMNS = 40  # limit of the columns tried for a board of another count
 _ALIKE, _MOST_ALIKE = 0.03, 0.8  # in sides, outlines of one size; fraction of the markers that agree on it
 
 
@@ -274,30 +275,50 @@ def _read_board(picture: Bytes, spec: Layout) -> tuple[ReadMarkers, Layout]:
         if best.agreeing == len(readings.outlines_px):
             break
         placed = placed_markers(read, _markers(other))
-        if placed.agreeing > best.agreeing:
+        is_usual = {other.columns, other.rows} == {spec.columns, spec.rows}
+        if placed.agreeing > best.agreeing + (not is_usual):  # one false reading agrees with one of many counts
             best, layout = placed, other
     return best, layout
 
 
 def _other_layouts(spec: Layout, read: MarkerReadings) -> Iterator[Layout]:
     """Variants of a specification that may be confused with it: the other layout, swapped counts, other first numbers,
-    and all of these at once, those with few changes first; then inner corners counted in place of squares."""
+    and all of these at once, those with few changes first; then other counts."""
     is_aruco = isinstance(spec, ArucoSpec)
     first_key: str = "first_marker" if is_aruco else "first_id"
     firsts: list[int] = other_first_numbers(read, getattr(spec, first_key), len(_markers(spec)))
     layouts = spec, _other_layout(spec)
     swapped: Changes = {"columns": spec.rows, "rows": spec.columns}
     numbered: list[Changes] = [{first_key: first} for first in firsts]
-    groups: tuple[list[Changes], ...] = [{}], [swapped], numbered, [swapped | each for each in numbered]
-    larger: Changes = {"columns": spec.columns + 1, "rows": spec.rows + 1}
-    if isinstance(spec, CharucoSpec):
-        with suppress(ValueError):  # raised where the dictionary has too few markers
-            replace(spec, **larger)
-            groups = *groups, [larger]
-    for changes in groups:
+    for changes in ([{}], [swapped], numbered, [swapped | each for each in numbered]):
         yield from (
             replace(layout, **change) for change, layout in product(changes, layouts) if change or layout != spec
         )
+    for layout in layouts:
+        yield from _of_other_counts(layout, read)
+
+
+def _of_other_counts(spec: Layout, read: MarkerReadings) -> Iterator[Layout]:
+    """The specification with the counts in whose layout most of the markers that were read lie, if it has others."""
+    first: int = getattr(spec, "first_marker" if isinstance(spec, ArucoSpec) else "first_id")
+    middles_px = {number: places[0].mean(axis=0) for number, places in read.outlines_px.items() if number >= first}
+    if len(middles_px) < _FEWEST_CORNERS:
+        return
+    near_px = float(np.median([_side_px(read.outlines_px[number][0]) for number in middles_px])) / 2.0
+    best, most = spec, 0
+    for columns in sorted(range(spec.fewest, _MOST_COLUMNS), key=lambda each: abs(each - spec.columns)):
+        of_rows = columns / (2 if isinstance(spec, CharucoSpec) else 1)
+        rows = max(int(np.ceil((max(middles_px) + 1 - first) / of_rows)), spec.fewest)
+        changes: Changes = {"columns": columns, "rows": rows}
+        with suppress(ValueError):  # raised where the dictionary has too few markers
+            other = replace(spec, **changes)
+            on_board = _markers(other)
+            middles = np.array([on_board[number].mean(axis=0) for number in middles_px])
+            _, inside = cv2.findHomography(middles, np.array(list(middles_px.values())), cv2.RANSAC, near_px)
+            if inside is not None and inside.sum() > most:
+                best, most = other, int(inside.sum())
+    if best != spec:
+        yield best
 
 
 def _other_layout(spec: Layout) -> Layout:

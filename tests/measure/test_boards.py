@@ -372,8 +372,20 @@ def test_a_board_of_less_than_half_the_size_is_another_one() -> None:
 def test_a_circle_grid_is_no_part_of_a_larger_one() -> None:
     larger = specs.CircleGridSpec(7, 5, 28.0, 13.0)
     board = measure_board(draw.make_scan(draw.tile_boards(larger, draw.circles_dark(larger), (1.0,))), SMALL_DOTS)
-    assert "the grid is larger than 6 x 5 dots" in board.reason
+    assert "no grid of 6 x 5 dots is whole in the scan; one of 7 x 5 dots is. Set columns and rows" in board.reason
     assert {mark.status for mark in board.marks} == {Status.ABSENT}
+
+
+@parametrize_with_studies(("columns", "rows"), [(8, 10), (8, 9), (7, 11), (6, 10), (8, 12), (10, 11)], quick=(0, 4))
+def test_an_asymmetric_grid_of_another_count_is_refused_with_its_own(columns: int, rows: int) -> None:
+    """8 x 10 places of 8 x 11 hold a grid in one way only: a row of dots had been left out unnoticed."""
+    grid = specs.CircleGridSpec(8, 11, 14.0, 9.0, asymmetric=True)
+    picture = draw.take_picture(grid, draw.board_from_pixel(4.0, 2e-4), draw.circles_dark(grid))
+    board = measure_board(draw.make_scan(picture), replace(grid, columns=columns, rows=rows))
+    assert "one of 44 dots in 11 rows of 4 is. Set columns and rows to its count" in board.reason
+    assert ("or show the whole grid" in board.reason) == (columns * rows > 88)
+    assert {mark.status for mark in board.marks} == {Status.ABSENT}
+    assert sum(mark.status == Status.MEASURED for mark in measure_board(draw.make_scan(picture), grid).marks) == 44
 
 
 def test_a_few_spots_are_no_circle_grid() -> None:
@@ -387,7 +399,7 @@ def test_a_few_spots_are_no_circle_grid() -> None:
     board = measure_board(scan, SMALL_DOTS)
     assert "no grid of 6 x 5 dots is whole in the scan; 5 spots are candidates for dots" in board.reason
     board = measure_board(scan, specs.CircleGridSpec(8, 11, 28.0, 12.0, asymmetric=True))
-    assert "no grid of 44 dots in 11 rows is whole in the scan" in board.reason  # 4 x 11, as OpenCV counts
+    assert "no grid of 44 dots in 11 rows of 4 is whole in the scan" in board.reason  # 4 x 11, as OpenCV counts
 
 
 @pytest.mark.parametrize(
@@ -561,6 +573,25 @@ def test_exchanged_counts_and_another_first_number_at_once() -> None:
     read = find_aruco(drawing, replace(aruco, columns=3, rows=4, first_marker=0))
     assert "but as with columns = 4, rows = 3, first_marker = 5." in read.reason
     assert len(find_aruco(drawing, aruco).corners) == 48
+
+
+@parametrize_with_studies(
+    ("columns", "rows", "words"),
+    [(4, 2, "rows = 3"), (3, 3, "columns = 4"), (6, 5, "columns = 4, rows = 3")],
+    quick=(0, 2),
+)
+def test_markers_on_a_board_of_another_count_name_it(columns: int, rows: int, words: str) -> None:
+    """The markers of further rows had been left out unnoticed."""
+    picture = cv2.aruco.GridBoard((4, 3), 20.0, 8.0, specs.aruco_dictionary("4X4_50"), np.arange(5, 17))
+    drawing = np.asarray(picture.generateImage((344, 264), marginSize=20), np.uint8)
+    read = find_aruco(drawing, specs.ArucoSpec("4X4_50", columns, rows, 20.0, 8.0, first_marker=5))
+    assert not read.corners
+    assert f"but as with {words}. Set that" in read.reason
+
+
+def test_charuco_rows_too_few_are_named() -> None:
+    spec = specs.CharucoSpec("4X4_50", 6, 7, 32.0, 24.0)
+    assert "but as with rows = 7" in find_charuco(generated(spec), replace(spec, rows=5)).reason
 
 
 @pytest.mark.parametrize("first", [0, 5])
