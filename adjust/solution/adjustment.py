@@ -30,6 +30,7 @@ from adjust.solution.blunder_hypotheses import (
     Trials,
     blunder_sentence,
     check_plausibility,
+    exchanged_fiducials,
     misnumbered_images,
     stations_elsewhere,
 )
@@ -223,12 +224,12 @@ class _Solver:
         return None if rest is None or start is None else (rest, start)
 
     def orientable(self, network: Network) -> tuple[Network, Approximations | None, dict[str, str]]:
-        """Leave out the images whose point numbers are off, and those for which no orientation is found.
+        """Leave out the images whose points or fiducials have wrong names, and those for which no orientation is found.
 
         Returns the remaining network, its own approximations and the reasons by frame. Approximations are None where
         too little would remain or something else is wrong.
         """
-        misnumbered = misnumbered_images(network)
+        misnumbered = exchanged_fiducials(network) or misnumbered_images(network)
         part = _leave_out(network, misnumbered) if misnumbered else network
         if part is None:
             sentences = dict.fromkeys(misnumbered.values())

@@ -21,6 +21,8 @@ from itertools import chain, combinations, product
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
 from scipy.special import chdtrc, chdtri
 
 from adjust.array_types import Array, Indices, Mask
@@ -48,6 +50,10 @@ FEWEST_IMAGES = 3  # images needed for a median misfit
 WORSE, LARGE = 4.0, 0.01  # times the median misfit of the images, and misfit above which other numbers are tried
 BETTER, MUCH_BETTER = 3.0, 10.0  # ratio by which right numbers lower the misfit of an image worse than most, or alike
 MOST_OFF = 30  # largest shift of numbers tried
+QUARTERS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))  # cosine and sine
+FEWEST_FIDUCIALS = 4  # of a frame, that tell by an affine transformation which are exchanged
+# Scan orientations: turned by quarters, and mirrored; the unmirrored ones first.
+TURNS = [flip @ np.array([[c, -s], [s, c]]) for flip in (np.eye(2), np.diag([-1.0, 1.0])) for c, s in QUARTERS]
 MARGIN = 0.01  # fraction of the frame that a mark may lie outside: edge of the outermost pixel, rounded frame size
 NEARLY_ALL = 0.9  # fraction of marks outside the image above which the axes are wrong, not the marks
 FLAT_BOARD = 1e-2  # relief of given points over their extent below which they are flat
@@ -370,7 +376,8 @@ def check_plausibility(result: Adjustment, trials: Trials) -> Adjustment:
     if result.termination == "singular" or not result.network.observed_points:
         return result
     views = _views(result)
-    outside = sorted(row for view in views for row in view.outside)
+    # The film transformations of an iteration that did not converge take marks anywhere.
+    outside = sorted(row for view in views if result.converged or view.digital for row in view.outside)
     remarks, misread = list(_marks_outside(result, outside, trials)), tuple(_both_sides(result, trials))
     if result.converged and not outside and not result.slips:
         remarks += [each for view in views for each in _principal_point(view, result, trials.family)]
@@ -566,6 +573,55 @@ def misnumbered_images(network: Network) -> dict[str, str]:
         for words, some in frames.items()
         for frame in some
     }
+
+
+def exchanged_fiducials(network: Network) -> dict[str, str]:
+    """Find the frames whose fiducials have each other's names, with the reasons; empty where all may be right.
+
+    An affine transformation of the given coordinates fits them far better under other names.
+    """
+    reasons = defaultdict[str, list[str]](list)
+    for number, image in enumerate(network.images):
+        marks = network.camera_by_name[image.camera].fiducials
+        rows = np.flatnonzero((network.image_numbers == number) & network.observations.has_kind("fiducial"))
+        names = [network.observations.point[row] for row in rows]
+        priors = [prior for name in names for prior in (marks[name].x_mm, marks[name].y_mm)]
+        if len(names) < FEWEST_FIDUCIALS or not all(np.isfinite(prior.sigma) for prior in priors):
+            continue
+        given_mm = np.array([prior.value for prior in priors]).reshape(-1, 2)
+        order = _other_names(given_mm, network.observations.xy_mm[rows])
+        renamed = {names[k]: names[other] for k, other in enumerate(order) if k != other}
+        if len(renamed) == 2:
+            reasons[f"{' and '.join(sorted(renamed))} are exchanged"].append(image.frame)
+        elif renamed:
+            reasons[", ".join(f"{name} is {other}" for name, other in renamed.items())].append(image.frame)
+    return {
+        frame: f"by the coordinates given, the fiducials of {shortened(some, NAMED)} have each other's names: {words}. "
+        "Correct the names, or the coordinates in the camera file."
+        for words, some in reasons.items()
+        for frame in some
+    }
+
+
+def _other_names(given_mm: Array, xy_mm: Array) -> list[int]:
+    """Index of the given mark (n, 2) that each observed one (n, 2) is, as few as possible exchanged."""
+    as_named, (given_mm, xy_mm) = list(range(len(xy_mm))), (each - each.mean(axis=0) for each in (given_mm, xy_mm))
+    misfit_mm = _affine_misfit(given_mm, xy_mm)
+    found = [(0, as_named)]
+    if misfit_mm > LARGE * np.ptp(xy_mm):
+        found += [
+            (int((order != as_named).sum()), order.tolist())
+            for turned in TURNS
+            for order in [linear_sum_assignment(cdist(xy_mm, given_mm @ turned.T))[1]]
+            if MUCH_BETTER * _affine_misfit(given_mm[order], xy_mm) < misfit_mm
+        ]
+    return min(found[1:] or found, key=lambda each: each[0])[1]
+
+
+def _affine_misfit(given_mm: Array, xy_mm: Array) -> float:
+    """Root mean square of what an affine transformation of centred places (n, 2) leaves of others."""
+    rest = xy_mm - given_mm @ np.linalg.lstsq(given_mm, xy_mm, rcond=None)[0]
+    return float(np.sqrt(np.mean(rest**2)))
 
 
 class _TransformedField(NamedTuple):

@@ -41,7 +41,7 @@ from adjust.quality.reliability import TOLD_APART, Snooping
 from adjust.quality.run import UM_PER_MM, GrossError, Run, residuals
 from adjust.quality.variance_components import added_variance, refined_factors
 from adjust.rank_defect.diagnosis import singular_directions
-from adjust.solution.model_hypotheses import Estimate, ModelHypothesis, continued, model_hypotheses
+from adjust.solution.model_hypotheses import Estimate, ModelHypothesis, continued, model_hypotheses, wrong_points
 from adjust.solution.reweighting import again
 
 LEVEL = 0.001  # probability of reporting anything where the model is correct
@@ -95,13 +95,23 @@ def explain(
     """
     if not run.converged or redundancy < CHECKED:
         return (), run
-    first = last = _Model(run, redundancy, probabilities, unmodelled)
+    first = last = before = _Model(run, redundancy, probabilities, unmodelled)
     found: list[Explanation] = []
     for _ in range(ROUNDS):
         if found and not last.exceeds(probabilities.family):
             break
         alike, has_rival = _best(last)
-        found += [_model_explanation(each, last) for each in alike]
+        if len(alike) == 1 and alike[0].hypothesis:
+            points = wrong_points(last.hypothesis, alike[0].hypothesis, alike[0].run)
+            # Estimates of the round before are spoilt by the points that were not yet found.
+            if last.kind == points.kind == "point" and not points.selection.words:
+                found.pop()
+            else:
+                before = last
+            alike = [replace(alike[0], hypothesis=points)]
+        else:
+            before = last
+        found += [_model_explanation(each, before) for each in alike]
         if not alike or has_rival:
             break
         last = alike[0]

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
+from scipy.special import chdtrc
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.board import BoardForm, board_form, disk_directions, strain_directions
@@ -56,6 +57,8 @@ CLEAR = 3.0  # standard deviations above which one of two changes of a board is 
 FEWEST_GIVEN, FEWEST_IMAGES = 5, 2  # given points, and images of one, that tell a wrong one
 MISMEASURED = 0.1  # relative error of the given diameter of disks whose effect is reported
 MOST_NAMED = 10  # points named in a message
+FEWEST_ALIKE = 3  # points whose shifts tell that all are the same
+LEVEL = 0.001  # probability of calling a point wrong that is where it is given, or equal shifts unequal
 INDEPENDENT = "points' unit; ± for independent errors, on real boards up to 5 times as much"
 ALIKE = 7.0  # difference of chi-square plus twice the unknowns below which two readings are not distinguished
 
@@ -693,6 +696,30 @@ def _wrong_points(run: Run, most: int) -> Iterator[ModelHypothesis]:
         yield replace(found, selection=selection)
 
 
+def wrong_points(earlier: ModelHypothesis | None, found: ModelHypothesis, run: Run) -> ModelHypothesis:
+    """Wrong single points as estimated in a run, with those of an earlier round, without those where they are given.
+
+    Other hypotheses are returned as they are.
+    """
+    rounds = [each for each in (earlier, found) if each and each.kind == "point" and not each.selection.words]
+    if found not in rounds:
+        return found
+    unknowns, cofactor, wrong = found.problem.unknowns, free_cofactor(run.end), list[tuple[str, Mask, Indices]]()
+    for each in rounds:
+        for name in each.selection.names:
+            mask = np.isin(each.problem.unknowns.point[name], each.added)
+            at = unknowns.point[name][mask]
+            off = run.end.state.values[at] - unknowns.given[at]
+            if chdtrc(len(at), off @ np.linalg.solve(cofactor.part(at), off)) < LEVEL:
+                wrong.append((name, mask, at))
+    if not wrong:
+        return found
+    names, masks, positions = zip(*wrong, strict=True)
+    added, selection = np.concatenate(positions), replace(found.selection, names=names)
+    words = _point_words(selection, np.array(masks), unknowns.given[added])
+    return replace(found, words=words, shown=added, selection=selection)
+
+
 def _point_words(selection: Selection, fixed: Mask, given: Array) -> Words:
     """Words on points whose fixed coordinates (k, 3) are not those given (n,), or on a group with one shift."""
     names, remedy = selection.names, "Correct the coordinates of these points, or their numbers among the marks."
@@ -703,11 +730,7 @@ def _point_words(selection: Selection, fixed: Mask, given: Array) -> Words:
             offs, sigmas = -found.value[None], found.sigma[None]
         else:
             offs[fixed], sigmas[fixed] = given - found.value, found.sigma
-        by = list[str]()
-        for off, sigma in zip(offs, sigmas, strict=True):
-            digits = [max(0, -int(np.floor(np.log10(max(s, 1e-12))))) for s in sigma]
-            rows = zip("XYZ", off, sigma, digits, strict=True)
-            by.append(", ".join(f"{axis} by {d:+.{n}f} ± {s:.1g}" for axis, d, s, n in rows if s > 0.0))
+        by = [_axes_words(*each) for each in zip(offs, sigmas, strict=True)]
         some = shortened(names, MOST_NAMED)
         if selection.words:
             return (
@@ -720,6 +743,12 @@ def _point_words(selection: Selection, fixed: Mask, given: Array) -> Words:
                 f"Point {names[0]} is not where it is given: its coordinates are off, {by[0]} (points' unit)",
                 "Correct the coordinates of this point, or its number among the marks.",
             )
+        if fixed.all() and (common := _common_shift(offs, found.covariance)):
+            return (
+                f"{len(names)} points are not where they are given: {some}; all are off by the same shift, "
+                f"{_axes_words(*common)} (points' unit)",
+                remedy,
+            )
         worst = np.argsort(-np.linalg.norm(offs, axis=1), kind="stable")[:NAMED]
         return (
             f"{len(names)} points are not where they are given: {some}; the coordinates of the worst are off, "
@@ -728,3 +757,22 @@ def _point_words(selection: Selection, fixed: Mask, given: Array) -> Words:
         )
 
     return words
+
+
+def _axes_words(off: Array, sigma: Array) -> str:
+    """Errors (3,) of coordinates with their standard deviations, 0 for those that are not tested."""
+    digits = [max(0, -int(np.floor(np.log10(max(s, 1e-12))))) for s in sigma]
+    rows = zip("XYZ", off, sigma, digits, strict=True)
+    return ", ".join(f"{axis} by {d:+.{n}f} ± {s:.1g}" for axis, d, s, n in rows if s > 0.0)
+
+
+def _common_shift(offs: Array, covariance: Array) -> tuple[Array, Array] | None:
+    """Weighted mean (3,) of the shifts (k, 3) of points, and its standard deviations; None where they differ."""
+    count = len(offs)
+    weight, same = np.linalg.inv(covariance), np.tile(np.eye(3), (count, 1))
+    of_mean = np.linalg.inv(same.T @ weight @ same)
+    mean = of_mean @ (same.T @ weight @ offs.ravel())
+    rest = (offs - mean).ravel()
+    if count < FEWEST_ALIKE or chdtrc(3 * (count - 1), rest @ weight @ rest) < LEVEL:
+        return None
+    return mean, np.sqrt(np.diag(of_mean))

@@ -1,7 +1,7 @@
 """What makes sigma0 too large is named, and nothing else is blamed: model, coordinates, whole networks."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Container, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -14,10 +14,12 @@ from studies import parametrize_with_studies
 
 from adjust import Adjustment, AdjustmentError, Distortion, Network, Observations, Options, Prior, adjust, approximate
 from adjust.functional_model.rotation import rotation_from_angles
+from adjust.problem.problem import number_reduced
 from adjust.quality.critical_values import Probabilities
 from adjust.solution.adjustment import adjust_unmodelled
 from adjust.solution.explanations import explain
 from adjust.solution.model_hypotheses import film_deformations
+from adjust.solution.result import adjust_problem
 
 QUICK = (
     "lens: no radial term",
@@ -204,6 +206,55 @@ def test_images_with_numbers_one_off_are_left_out_or_all_is_refused(flat: bool) 
     everywhere = replace(made, groups=np.ones(len(made.groups)))
     with pytest.raises(AdjustmentError, match="their numbers are 2 too low"):
         adjust(faults.misfit_network(everywhere, faults.Effects(numbers_off=-2), SOUND, rng))
+
+
+def _with_fiducials_named(network: Network, other: Mapping[str, str], frames: Container[str]) -> Network:
+    rows = zip(network.observations.point, network.observations.kind, network.observations.image, strict=True)
+    named = tuple(other.get(p, p) if kind == "fiducial" and image in frames else p for p, kind, image in rows)
+    return nets.set_observations(network, point=named)
+
+
+@pytest.mark.parametrize(
+    ("other", "words"),
+    [
+        ({"1": "2", "2": "1"}, "1 and 2 are exchanged"),
+        ({"1": "2", "2": "3", "3": "1"}, "2 is 1, 3 is 2, 1 is 3"),
+    ],
+)
+def test_frames_whose_fiducials_have_each_others_names_are_left_out_or_all_is_refused(
+    other: Mapping[str, str], words: str
+) -> None:
+    made, _ = nets.simulated(np.random.default_rng(4), fiducial_sigma=0.005)
+    result = adjust(_with_fiducials_named(made, other, {"f1"}))
+    assert result.left_out.keys() == {"f1"}
+    assert words in result.left_out["f1"]
+    assert result.converged
+    assert result.sigma0 == pytest.approx(1.0, abs=0.3)
+    with pytest.raises(AdjustmentError, match=rf"the fiducials of f0, f1, f2 have each other's names: {words}"):
+        adjust(_with_fiducials_named(made, other, {image.name for image in made.images}))
+
+
+def test_a_film_that_did_not_converge_has_no_marks_outside_the_picture() -> None:
+    made, start = nets.simulated(np.random.default_rng(4), fiducial_sigma=0.005)
+    small = nets.set_camera(made, frame_mm=(60.0, 60.0))
+    outside = [
+        any("lie outside the picture" in each for each in adjust(small, start, o).remarks)
+        for o in (Options(), Options(iteration_limit=1))
+    ]
+    assert outside == [True, False]
+
+
+def test_a_block_of_points_that_is_raised_is_named_whole_with_its_one_shift() -> None:
+    """The first of two rounds names some of them, with estimates that the others spoil."""
+    rng = np.random.default_rng(3)
+    made, start = nets.simulated(rng, points=nets.field_points(rng, 24), fiducial_sigma=0.005)
+    raised = {f"PT.{k}.Z" for k in range(8)}
+    given = nets.map_priors(made, lambda name, prior: replace(prior, value=prior.value + 5.0 * (name in raised)))
+    (found,) = adjust_problem(number_reduced(given, start)[0], Options()).explanations
+    assert found.cause.startswith("8 points are not where they are given")
+    assert found.sigma0[1] == pytest.approx(1.0, abs=0.2)
+    shift, sigma = map(float, re.findall(r"all are off by the same shift, .* Z by (\S+) ± (\S+) ", found.cause)[0])
+    assert abs(shift - 5.0) < 4.0 * sigma < 1.0
 
 
 @pytest.mark.parametrize("times", [0.5, 2.0])
