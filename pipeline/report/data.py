@@ -6,6 +6,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
@@ -24,6 +25,8 @@ from pipeline.results.thumbnail import Thumbnail
 from pipeline.types import Array
 
 MarkKey = tuple[str, str, str]  # image, kind, point
+# Sections of the report that problems refer to.
+ReportSection = Literal["camera", "frames", "coverage", "fiducials", "reliability", "check", "fractions"]
 _SENTENCE = re.compile(r"(?<=[.:]) (?=[A-Z])")
 
 
@@ -38,7 +41,7 @@ class ReportedProblem:
     next_step: str = ""
     images: tuple[str, ...] = field(default=(), compare=False)
     marks: tuple[MarkKey, ...] = field(default=(), compare=False)
-    section: str = field(default="", compare=False)
+    section: ReportSection | None = field(default=None, compare=False)
 
     @property
     def cause(self) -> str:

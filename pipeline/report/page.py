@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -17,7 +17,7 @@ from pipeline.archive.verdicts import scan_counts
 from pipeline.drawing import svg
 from pipeline.report import frame_problems
 from pipeline.report.camera_views import camera_view, joined_view, scanner_view
-from pipeline.report.data import ReportData, ReportedFrame, ReportedProblem, frames
+from pipeline.report.data import ReportData, ReportedFrame, ReportedProblem, ReportSection, frames
 from pipeline.report.fiducials import correction_sentence, figure_plot
 from pipeline.report.frame_views import FrameView, arrow_scale, frame_views
 from pipeline.report.load import BEST_FIRST, frame_counts, verdict_counts
@@ -31,7 +31,8 @@ from pipeline.text.files import write_atomically
 LIST_LIMIT = 200  # rows of a long table
 LINKS = 3  # largest number of links from a problem to frames
 MOST_CARDS = 60  # largest number of marks that need a look
-SECTIONS = {
+SECTIONS: Mapping[ReportSection, str] = {
+    "camera": "Camera",
     "frames": "Frames",
     "coverage": "Coverage",
     "fiducials": "Fiducial marks",

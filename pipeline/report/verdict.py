@@ -11,7 +11,7 @@ from scipy.special import chdtri, ndtri
 
 from adjust.problem.parameter import Parameter, description, parameter_from_text
 from measure.flags import Status
-from pipeline.report.data import ReportData, ReportedFrame, ReportedProblem, frames
+from pipeline.report.data import ReportData, ReportedFrame, ReportedProblem, ReportSection, frames
 from pipeline.report.frame_problems import frame_problems, pixel_locking, places_px
 from pipeline.report.numbers import fixed, value_and_sigma
 from pipeline.report.parameters import camera_values, spoken_name
@@ -47,7 +47,7 @@ CALIBRATION = (
 )
 # Observations other than marks: attribute of the adjustment, their name in singular and plural, heading of their list,
 # remedy, and section of the report.
-FURTHER = (
+FURTHER: tuple[tuple[str, str, str, str, str, ReportSection | None], ...] = (
     (
         "distances", "distance", "distances", f"{_CONTRADICTED_BY})",
         f"Look for a wrong point or unit in the file of distances; {_BOTH_NAMED}", "reliability",
@@ -58,7 +58,7 @@ FURTHER = (
     ),
     (
         "antennas", "coordinate of antennas", "coordinates of antennas", f"{_CONTRADICTED_BY})",
-        "Look for a wrong image or time, and at the antenna's offset and its sign.", "",
+        "Look for a wrong image or time, and at the antenna's offset and its sign.", None,
     ),
 )  # fmt: skip
 

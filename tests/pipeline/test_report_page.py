@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import made_up_calibration
 import numpy as np
@@ -22,7 +22,7 @@ from adjust.solution.explanations import Explanation
 from measure import Code, MarkMeasurement, Reason, ScanOrientation, Status
 from measure.results import FrameMeasurement
 from pipeline.report import ReportData, ReportedProblem, judge, render_report, write_report
-from pipeline.report.data import frames
+from pipeline.report.data import ReportSection, frames
 from pipeline.report.frame_problems import fraction_test, places_px
 from pipeline.report.parameters import spoken_name
 from pipeline.report.verdict import critical_w, problems_by_test, sigma0_bounds
@@ -420,8 +420,17 @@ def test_a_free_principal_distance_that_images_hardly_determine(
         name: replace(camera, principal_distance_mm=Quantity(153.0, sigma, GivenQuantity(153.0, given)))
         for name, camera in present(adjusted_data.adjustment).cameras.items()
     }
-    found = [each.what for each in judge(changed(adjusted_data, cameras=cameras)).problems]
-    assert any("is known to 6 % only" in what for what in found) == is_problem
+    text = rendered(changed(adjusted_data, cameras=cameras)).text
+    assert ("is known to 6 % only" in text) == is_problem
+
+
+def test_every_section_that_a_problem_names_is_linked_and_on_the_page() -> None:
+    """The columns are locked to whole pixels, for the histograms to be shown."""
+    problems = tuple(ReportedProblem(f"Wrong: {section}.", section=section) for section in get_args(ReportSection))
+    html = render_report(replace(set_frames(made_up_calibration.adjusted_report(), locked), problems=problems))
+    linked = re.findall(r'Wrong: (\w+)\.(?:(?!</li>).)*href="#(\w+)"', html, re.DOTALL)
+    assert linked == [(section, section) for section in get_args(ReportSection)]
+    assert set(get_args(ReportSection)) <= set(Document(html).ids)
 
 
 def test_the_table_of_exit_code_1_is_that_of_the_code() -> None:
@@ -517,10 +526,12 @@ def near_a_column(mark: MarkMeasurement, off_px: float) -> MarkMeasurement:
     return replace(mark, center_px=np.array([round(mark.center_px[0]) + off_px, mark.center_px[1]]))
 
 
-def test_locked_positions_need_attention_and_recurring_ones_do_not(measured_data: ReportData) -> None:
-    def locked(frame: FrameMeasurement) -> FrameMeasurement:
-        return replace(frame, marks=tuple(near_a_column(mark, 0.02) for mark in frame.marks))
+def locked(frame: FrameMeasurement) -> FrameMeasurement:
+    """The frame with all its marks near whole columns."""
+    return replace(frame, marks=tuple(near_a_column(mark, 0.02) for mark in frame.marks))
 
+
+def test_locked_positions_need_attention_and_recurring_ones_do_not(measured_data: ReportData) -> None:
     text = describe(set_frames(measured_data, locked))
     assert "The column positions of the marks prefer parts of a pixel" in text
     assert "The row positions" not in text
