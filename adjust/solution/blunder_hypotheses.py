@@ -240,11 +240,14 @@ def _distances(network: Network) -> Iterator[NetworkHypothesis]:
 def _exchanged_frames(network: Network, given: Adjustment | None) -> Iterator[NetworkHypothesis]:
     """Hypothesis: the targets of two frames of a camera are exchanged; largest residuals first."""
     observations = network.observations
-    squares = np.zeros(len(observations)) if given is None else (given.residuals.v_mm**2).sum(axis=1)
-    sums = np.bincount(network.image_numbers, squares, len(network.images)).tolist()
+    sums = dict[str, float]()
+    if given is not None:  # whose network may lack points and images that were left out
+        squares, names = (given.residuals.v_mm**2).sum(axis=1), [image.name for image in given.network.images]
+        by_image = np.bincount(given.network.image_numbers, squares, len(names))
+        sums = dict(zip(names, by_image.tolist(), strict=True))
     films = {
-        image.name: (size, image.camera)
-        for image, size in zip(network.images, sums, strict=True)
+        image.name: (sums.get(image.name, 0.0), image.camera)
+        for image in network.images
         if image.transformation != "none" and image.name not in network.objectless_images
     }
     worst = sorted(films, key=lambda name: (-films[name][0], name))

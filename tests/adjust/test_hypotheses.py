@@ -682,6 +682,15 @@ def test_point_without_two_rays_that_meet_is_left_out_and_named() -> None:
     assert not result.suspects
 
 
+def test_rays_that_do_not_meet_are_named_where_sigma0_is_large_too() -> None:
+    """The hypotheses on frames as a whole look at residuals, of which the point that is left out has none."""
+    spoilt, _ = _one_ray(_network(2))
+    spoilt = nets.drop_rows(spoilt, [_at(spoilt, image, "12") for image in ("f1", "f3")])
+    result = adjust(nets.set_observations(spoilt, covariance_mm2=spoilt.observations.covariance_mm2 / 16.0))
+    assert result.sigma0 == pytest.approx(4.0, rel=0.2)
+    assert any("No two rays of point 12 meet, from the images f0, f2" in each for each in result.warnings)
+
+
 def test_one_of_two_pairs_of_rays_that_meet_is_not_distinguishable_from_the_other() -> None:
     """Of four rays of a point, two belong to another: nothing tells which point has the name."""
     made = _network(3)
