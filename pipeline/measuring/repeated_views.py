@@ -17,6 +17,7 @@ _TARGET_WEIGHT = 0.1  # of distances of targets: in rectified scans of different
 _SAME_SCAN_PX = 0.2  # px: film that is laid on a scanner again lies many pixels elsewhere
 _FEWEST_COMMON = 4  # points in both of two images
 _GRID = 128  # cells a side in which the content of two scans is compared
+_EDGE = 0.125  # fraction of the box on each side that is left out: all frames show the edge of the camera's frame
 _AROUND = 9  # cells whose mean is subtracted: light falls off towards the corners in all frames
 _AT_MARK = 2.5  # cells around a mark that are left out: all frames show it
 _SAME_CONTENT = 0.5  # correlation; contents of different frames have less than 0.1
@@ -90,7 +91,7 @@ def _content(scan: MeasuredScan, places: Array, box: Box, picture: Picture) -> A
     grey = picture(scan)
     if grey is None:
         return None
-    steps = (np.arange(_GRID) + 0.5) / _GRID
+    steps = _EDGE + (1.0 - 2.0 * _EDGE) * (np.arange(_GRID) + 0.5) / _GRID
     low, high = np.array(box[:2]), np.array(box[2:])
     cells = np.stack(np.meshgrid(*(low + (high - low) * steps[:, None]).T), axis=-1)  # (rows, columns, 2)
     size_px = np.array(grey.shape[::-1])

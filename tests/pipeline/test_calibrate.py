@@ -357,13 +357,17 @@ def test_a_board_at_the_same_place_counts_once() -> None:
 
 
 def drawn_picture(seed: int) -> Array:
-    """(400, 500) px of a landscape, darker towards the corners as every frame of the camera, with its marks."""
+    """(400, 500) px of a landscape, darker towards the corners as all of the camera, with edge and marks."""
     rng = np.random.default_rng(seed)
     sides = np.stack(np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in (500, 400))), axis=-1)
     land = cv2.GaussianBlur(rng.normal(0.0, 1.0, (400, 500)), (0, 0), 3.0)
-    picture = (120.0 + 40.0 * land / land.std()) * (1.0 - 0.4 * (sides**2).sum(axis=-1) / 2)
-    for mark in named_scan("").frame.marks:
-        col, row = (round(float(at) / 10.0) for at in present(mark.center_px))
+    picture = (160.0 + 20.0 * land / land.std()) * (1.0 - 0.4 * (sides**2).sum(axis=-1) / 2)
+    places = np.array([present(mark.center_px) / 10.0 for mark in named_scan("").frame.marks]).round().astype(int)
+    inside = np.zeros(picture.shape, dtype=bool)
+    (left, upper), (right, lower) = places.min(axis=0) + 8, places.max(axis=0) - 8
+    inside[upper:lower, left:right] = True
+    picture[~inside] = 1.0  # film beyond the frame, whose edge lies alike in all scans
+    for col, row in places:
         picture[max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2] = 255.0
     return np.asarray(np.clip(picture, 1.0, None))
 
