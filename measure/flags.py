@@ -148,6 +148,7 @@ class Cause(MeaningfulWord):
     GIVEN_PLACES = "given places", "Disagreement with the given coordinates."
     OTHER_FRAMES = "other frames", "Disagreement with the camera's other frames."
     INTERPOLATION = "interpolation", "Interpolation between two scans, or none: nearest neighbours."
+    MOTION = "motion", "Motion blur of the whole scan: the place lies anywhere in it."
     CLICK = "click", "A person pointed at it, and nothing could be matched there."
     LENS = "taking lens", "Uncertainty of the lens that photographed the film, from its calibration."
 

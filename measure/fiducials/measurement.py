@@ -32,7 +32,7 @@ from measure.marks.shapes import (
     limit_to_frame,
 )
 from measure.matching.covariance import honest_covariance
-from measure.noise.resampling import NEAREST_PX2, is_nearest_neighbour
+from measure.noise.resampling import find_alterations
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
 from measure.scans.scan import Scan
 
@@ -50,11 +50,6 @@ _HARDLY = 0.5  # times the fraction of all marks found
 _PLAIN_PX = 3.0  # px across the finest line of a mark: both edges and the inside are resolved
 _ASSUMED = Reason(
     "the scan orientation is only assumed, and another of the learned marks would have its origin elsewhere", Code.POSE
-)
-_NEAREST = Reason(
-    "The scan was turned or enlarged with nearest neighbours: each of its marks may lie half a pixel off. Measure the "
-    "scan that it was made from, or turn that with interpolation.",
-    Code.IMPRECISE,
 )
 _OWN = Reason("its template is its own picture: nothing checks its place", Code.OWN_PICTURE)
 
@@ -304,9 +299,9 @@ def present_frame(
         places = zip(frame.layout.marks, frame.detections, frame.predicted_px, strict=True)
         marks = tuple(_unmeasured(mark.id, each, place, chance) for mark, each, place in places)
         return FrameMeasurement(frame.scan.name, marks, pose, problems=tuple(problems), weights=frame.weights)
-    if is_nearest_neighbour(frame.scan):
-        detections = (each.amend(parts={Cause.INTERPOLATION: NEAREST_PX2}) for each in frame.detections)
-        frame, problems = replace(frame, detections=tuple(detections)), (*problems, _NEAREST)
+    for altered in find_alterations(frame.scan):
+        detections = (each.amend(parts={altered.cause: altered.px2}) for each in frame.detections)
+        frame, problems = replace(frame, detections=tuple(detections)), (*problems, altered.reason)
     unnamed = next((problem for problem in problems if Code.AMBIGUOUS in problem.codes), NO_REASON)
     marks = tuple(_row(mark, index, frame, pose, chance, unnamed) for index, mark in enumerate(frame.layout.marks))
     problems = (*problems, *_orientation_problems(frame, pitch_um))

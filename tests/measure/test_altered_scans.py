@@ -1,4 +1,5 @@
-"""Scans turned and scaled with nearest neighbours, by copying pixels of textures: found, and nothing else is."""
+"""Scans turned and scaled with nearest neighbours, by copying pixels of textures, and blurred by motion: found, and
+nothing else is."""
 
 from functools import lru_cache
 
@@ -6,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 from drawn import ALIKE, Array, center, frame_picture, make_scan, measure_grey, pixel_from_camera
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import convolve, gaussian_filter
 
 from measure import Code, Status
 from measure.flags import Cause
-from measure.noise.resampling import is_nearest_neighbour
+from measure.noise.resampling import find_alterations
 
 SIDE = 700
 
@@ -36,6 +37,20 @@ def nearest(picture: Array, turn_deg: float, scale: tuple[float, float] = (1.0, 
     return np.asarray(picture[tuple(own)])
 
 
+def moved(picture: Array, length_px: int, slope: tuple[int, int]) -> Array:
+    """The picture's mean over as many pixels along a slope in columns and rows, each of -1 to 1."""
+    reach = length_px // 2
+    kernel = np.zeros((length_px, length_px))
+    for step in range(-reach, reach + 1):
+        kernel[reach + step * slope[1], reach + step * slope[0]] = 1 / length_px
+    return np.asarray(convolve(picture, kernel, mode="nearest"))
+
+
+def causes(picture: Array) -> list[Cause]:
+    """Causes of what is found to be done to the whole picture."""
+    return [each.cause for each in find_alterations(make_scan(picture, 255))]
+
+
 def jpeg(picture: Array, quality: int) -> Array:
     stored = cv2.imencode(".jpg", picture.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     return np.asarray(cv2.imdecode(stored, cv2.IMREAD_GRAYSCALE), float)
@@ -45,10 +60,22 @@ def jpeg(picture: Array, quality: int) -> Array:
     ("turn_deg", "scale"), [(0.5, (1.0, 1.0)), (-1.2, (1.0, 1.0)), (0.0, (1.01, 1.01)), (0.0, (1.0, 1.012))]
 )
 def test_nearest_neighbours_are_found(turn_deg: float, scale: tuple[float, float]) -> None:
-    assert is_nearest_neighbour(make_scan(nearest(film(), turn_deg, scale), 255))
+    assert causes(nearest(film(), turn_deg, scale)) == [Cause.INTERPOLATION]
 
 
-def test_nothing_else_is_taken_for_nearest_neighbours() -> None:
+@pytest.mark.parametrize(
+    ("length_px", "slope", "named"),
+    [(3, (1, 0), "3 px along rows"), (5, (0, 1), "5 px along columns"), (5, (1, -1), "to the right by 135 degrees")],
+)
+def test_motion_is_found(length_px: int, slope: tuple[int, int], named: str) -> None:
+    (found,) = find_alterations(make_scan(np.rint(moved(film(), length_px, slope)), 255))
+    along = np.array(slope)
+    assert found.cause is Cause.MOTION
+    assert named in found.reason
+    assert found.px2 == pytest.approx(((length_px**2) - 1 / (along @ along)) / 12 * np.outer(along, along), rel=0.05)
+
+
+def test_nothing_else_is_taken_for_an_altered_scan() -> None:
     picture = film()
     turned = cv2.getRotationMatrix2D((SIDE / 2, SIDE / 2), 0.5, 1.01)
     interpolated = cv2.warpAffine(picture, turned, (SIDE, SIDE), flags=cv2.INTER_LINEAR)
@@ -57,7 +84,7 @@ def test_nothing_else_is_taken_for_nearest_neighbours() -> None:
     posterised = 36 * np.rint(picture / 36)
     resampled = [np.asarray(each, float) for each in (interpolated, enlarged)]
     for each in (picture, *resampled, saturated, posterised, jpeg(picture, 10), np.zeros((SIDE, SIDE))):
-        assert not is_nearest_neighbour(make_scan(each, 255))
+        assert not causes(each)
 
 
 def test_marks_of_a_scan_turned_with_nearest_neighbours_may_be_half_a_pixel_off() -> None:
@@ -70,3 +97,16 @@ def test_marks_of_a_scan_turned_with_nearest_neighbours_may_be_half_a_pixel_off(
         assert mark.covariance is not None
         assert mark.covariance.sigmas_px[Cause.INTERPOLATION] == pytest.approx(12**-0.5)
         assert np.abs(center(mark) - back @ matrix @ (*given.xy_mm, 1.0)).max() < 0.6
+
+
+def test_marks_of_a_scan_blurred_by_motion_may_lie_anywhere_in_the_blur() -> None:
+    matrix, random = pixel_from_camera("0"), np.random.default_rng(6)
+    picture = frame_picture(ALIKE, matrix)
+    picture = moved(picture + random.normal(0.0, 8.0, picture.shape), 5, (1, 0))
+    result = measure_grey(np.rint(picture), ALIKE)
+    assert [Code.IMPRECISE in problem.codes for problem in result.problems] == [True]
+    for mark, given in zip(result.marks, ALIKE.marks, strict=True):
+        assert mark.status is Status.WEAK
+        assert mark.covariance is not None
+        assert mark.covariance.parts[Cause.MOTION] == pytest.approx(np.diag([2.0, 0.0]), rel=0.1, abs=1e-9)
+        assert np.abs(center(mark) - matrix @ (*given.xy_mm, 1.0)).max() < 1.0
