@@ -267,18 +267,20 @@ def _own_affinities(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
         worst = shortened([images[k].name for k in np.argsort(-sizes, kind="stable")], NAMED)
         return (
             f"The images of camera {camera.name} are distorted each in its own way, stretched or sheared by up to "
-            f"{100.0 * sizes.max():.2g} % (largest first: {worst})",
+            f"{100.0 * sizes.max():.2g} % (largest first: {worst}), or each has a principal point of its own",
             "Look for motion of camera or object while a picture was taken (rolling shutter, long exposure) and for "
             "stabilisation: fix both, give more light, and take the pictures again.",
         )
 
-    found = _displaced_images(run, "affinities", "affinities", camera, words, fields_mm.reshape(len(fields_mm), -1, 2))
-    # Affinities of all images of a flat object leave the interior orientation open: it is held where it is.
-    unknowns = found.problem.unknowns
+    # Affinities of all images of a flat object leave the interior orientation open, and contain the camera's own: these
+    # are held where they are.
+    unknowns, of = problem.unknowns, family(camera.distortion.family)
+    known = {*INTERIOR_NAMES, *dict(of.groups).get("affinity", ())}
     sigma = unknowns.sigma.copy()
-    interior = unknowns.camera[camera.name][: len(INTERIOR_NAMES)]
-    sigma[interior] = np.where(np.isinf(sigma[interior]), 0.0, sigma[interior])
-    yield replace(found, problem=replace(found.problem, unknowns=replace(unknowns, sigma=sigma)))
+    sigma[unknowns.camera[camera.name][[name in known for name in (*INTERIOR_NAMES, *of.parameters)]]] = 0.0
+    held = replace(run, problem=replace(problem, unknowns=replace(unknowns, sigma=sigma)))
+    fields_mm = fields_mm.reshape(len(fields_mm), -1, 2)
+    yield _displaced_images(held, "affinities", "affinities", camera, words, fields_mm)
 
 
 def _drift(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:

@@ -767,7 +767,12 @@ MISFITS = {
         lambda e: Effects(side=0.1 * e), ("all on one side of a line",), size=3, fields=False
     ),
     "rows of an image jump": Misfit(lambda e: Effects(jump=0.01 * e), ("All marks of image im",), size=2),
-    "pictures moved": Misfit(lambda e: Effects(motion=0.01 * e), ("distorted each in its own way",), size=16),
+    "pictures moved": Misfit(
+        lambda e: Effects(motion=0.01 * e),
+        ("distorted each in its own way",),
+        free=("k1", "k2", "p1", "p2", "b1"),
+        size=16,
+    ),
     "rows of all images jump": Misfit(lambda e: Effects(jumps=0.01 * e), ("All marks of the images of",), size=2),
     "a quarter of the points elsewhere": Misfit(
         lambda e: Effects(third=2.0), ("points are not where they are given",), sized=False
