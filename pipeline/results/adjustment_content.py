@@ -189,8 +189,12 @@ def _camera(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, float
         parameter = Parameter.interior(camera.name, name)
         if is_idle:
             return replace(_quantity(adjustment, parameter, given), sigma=math.nan)
-        return _quantity(adjustment, parameter, given, test=tests.get(name))
+        found = _quantity(adjustment, parameter, given, test=tests.get(name))
+        return replace(found, sigma_clusters=clusters.get(parameter)) if found.sigma else found
 
+    keys = [key for key in adjustment.parameters if (key.kind, key.owner) == ("interior", camera.name)]
+    by_images = adjustment.cluster_covariance_of(keys) if keys and adjustment.unmodelled_mm else None
+    clusters = {} if by_images is None else dict(zip(keys, np.sqrt(np.diag(by_images)).tolist(), strict=True))
     given = camera.distortion.parameters
     parameters = {key: quantity(key, given.get(key, Prior(0.0))) for key in parameter_names(camera.distortion.family)}
     reach = adjustment.lens_reach(camera, frame_mm)

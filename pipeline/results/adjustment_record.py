@@ -42,7 +42,9 @@ class GivenQuantity:
 class Quantity:
     """Estimate with its a-posteriori standard deviation, 0 if fixed and NaN without a solution.
 
-    given: prior; t, p: statistic and p-value of its significance test, None if not tested.
+    sigma_clusters: standard deviation by leaving out one image at a time, valid where errors within an image are
+    correlated, with unmodelled errors; the larger of both is the one to use. given: prior; t, p: statistic and p-value
+    of its significance test, None if not tested.
     """
 
     value: Number
@@ -50,6 +52,7 @@ class Quantity:
     given: GivenQuantity | None = None
     t: NumberOrNone = None
     p: NumberOrNone = None
+    sigma_clusters: NumberOrNone = None
 
 
 @dataclass(frozen=True, slots=True)

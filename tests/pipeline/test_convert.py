@@ -93,6 +93,10 @@ def test_the_larger_covariance_is_converted_saved_and_used(tmp_path: Path, print
     keys = [Parameter.interior("L", name) for name in names]
     sigmas = np.sqrt(np.diag(known.select_larger(keys)))
     assert sigmas[3] > 3.0 * np.sqrt(known.select(keys[3:4])[0, 0])
+    written = json.loads(first.read_text())["cameras"]["L"]
+    quantities = written["principal_distance_mm"], *written["principal_point_mm"].values(), written["distortion"]["k1"]
+    clusters = np.sqrt(np.diag(present(known.clusters).select(keys[:4])))
+    assert [each["sigma_clusters"] for each in quantities] == pytest.approx(clusters)
     values = json.loads(printed("convert", first, "brown", out, "--json"))["values"]
     assert [values[name]["sigma"] for name in names] == pytest.approx(sigmas, rel=1e-6)
     converted = read_covariance(out / "adjustment.json")
