@@ -20,7 +20,7 @@ from benchmarks.harness import Row
 
 Array = NDArray[np.float64]
 
-HALF = (110.0, 110.0)
+CORNERS = np.array([(-110.0, -110.0), (110.0, 110.0)])
 MARKS = np.array([(-106.0, -106.0), (106.0, -106.0), (106.0, 106.0), (-106.0, 106.0)])
 NAMES = ("c", "x0", "y0", "k3", "k5", "p1", "p2")
 AT = np.array([0, 1, 2, 3, 4, 6, 7])  # positions in c, x0, y0, k3, k5, k7, p1, p2, p3, p4
@@ -88,7 +88,7 @@ def case(
     years = YEARS if series else YEARS[[0, -1]]
     of_year = (years - years[0]) / np.ptp(years)
     found = [
-        compare([draw_camera(rng, change * part) for part in of_year], HALF, years if series else None)
+        compare([draw_camera(rng, change * part) for part in of_year], CORNERS, years if series else None)
         for _ in range(pairs)
     ]
     drift = np.mean([(each if series else each.same).probability < LEVEL for each in found])

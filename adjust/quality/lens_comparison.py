@@ -12,12 +12,12 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from scipy.linalg import block_diag, qr
-from scipy.special import fdtrc
 
 from adjust.array_types import Array
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Lens
 from adjust.functional_model.projection import ray_by_orientation
+from adjust.quality.significance import f_probability
 
 Use = Literal["space", "flat"]
 
@@ -93,7 +93,7 @@ class Comparison:
 
 def compare(
     calibrations: Sequence[CameraCalibration],
-    half_mm: tuple[float, float],
+    corners_mm: Array,
     times: Sequence[float] | Array | None = None,
     use: Use = "space",
 ) -> Comparison:
@@ -101,7 +101,7 @@ def compare(
 
     Parameters
     ----------
-    half_mm : half the frame in x' and y', over which the field is taken.
+    corners_mm : (2, 2) lower left and upper right corner of the area in the camera frame over which the field is taken.
     times : of the calibrations, such as years; by default 0, 1, 2, ...
     use : changes that the exterior orientation absorbs. "space": rotations; "flat": also shifts, as over flat ground,
         where a change of c or of the principal point is a change of the station.
@@ -119,10 +119,11 @@ def compare(
     if len(when) != len(calibrations) or not (np.diff(when) > 0).all():
         raise AdjustmentError(f"{len(calibrations)} calibrations need as many times, in rising order, not {when}.")
     shared = tuple(id for id in calibrations[0].fiducials if all(id in each.fiducials for each in calibrations))
-    across, along = (np.linspace(-half, half, _GRID) for half in half_mm)
+    across, along = (np.linspace(*ends, _GRID) for ends in np.transpose(corners_mm))
     places = np.stack(np.meshgrid(across, along), axis=-1).reshape(-1, 2)
     views = [_view(each, calibrations[0], places, shared, use) for each in calibrations]
-    same, trend = _tests(views, when, min(each.redundancy for each in calibrations))
+    redundancies = [each.redundancy for each in calibrations if each.redundancy > 0.0]
+    same, trend = _tests(views, when, min(redundancies, default=0.0))
     freeing, count = _freeing(views[0].unseen, len(shared)), len(places)
     one = np.eye(len(views))
     field, covariance = map(np.array, zip(*(_freed(views, freeing, each - one[0]) for each in one[1:]), strict=True))
@@ -271,8 +272,8 @@ def _tests(views: Sequence[_View], times: Array, redundancy: float) -> tuple[Tes
         return float(rest @ rest), explained.shape[1]
 
     def test(chi: float, freedom: int) -> Test:
-        """F-test instead of chi-square, since the sigma0 of a calibration may come from few observations."""
-        probability = float(fdtrc(freedom, redundancy, chi / freedom)) if freedom and redundancy else 1.0
+        """F-test where sigma0 of a calibration comes from observations, perhaps few; chi-square where it is given."""
+        probability = f_probability(chi / freedom, freedom, redundancy) if freedom else 1.0
         return Test(chi, freedom, probability)
 
     (still, fewer), (less, more) = left_over(steady), left_over(steady, moving)

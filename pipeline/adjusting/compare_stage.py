@@ -56,10 +56,19 @@ def run_compare(
     contents = {path: read_adjustment(path) for path in paths}
     lenses = {path: calibrated_lens(path, content, camera) for path, content in contents.items()}
     calibrations = [_calibration(path, contents[path], *lenses[path], label) for path, label in labels.items()]
-    # Half width and height of the area calibrated in all: extent of the observations from the origin.
-    halves = [np.abs(observed_mm(path, contents[path], name)).max(axis=0) for path, (name, _) in lenses.items()]
-    half_x_mm, half_y_mm = np.min(halves, axis=0).tolist()
-    comparison = compare(calibrations, (half_x_mm, half_y_mm), times, use)
+    observed = [observed_mm(path, contents[path], name) for path, (name, _) in lenses.items()]
+    corners_mm = np.array(  # of the area that all have observed
+        [
+            np.max([each.min(axis=0) for each in observed], axis=0),
+            np.min([each.max(axis=0) for each in observed], axis=0),
+        ]
+    )
+    if not (corners_mm[0] < corners_mm[1]).all():
+        raise InputError(
+            f"{listed([str(path) for path in paths])}: no part of the image was observed in all of them, so that there "
+            "is nothing to compare. Are they of one camera?"
+        )
+    comparison = compare(calibrations, corners_mm, times, use)
     remarks = _remarks(contents, [name for name, _ in lenses.values()])
     if comparison.same.probability > _TOO_ALIKE:
         remarks += ("they agree better than independent calibrations can: were the same photographs adjusted?",)

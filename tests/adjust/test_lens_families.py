@@ -378,7 +378,7 @@ def test_every_parameter_has_its_unit_and_a_ladder_names_only_parameters() -> No
         assert {each for rung in of.ladder for each in rung.split()} <= set(of.parameters)
 
 
-HALF = (110.0, 110.0)
+CORNERS = np.array([(-110.0, -110.0), (110.0, 110.0)])
 MARKS = {str(i): np.array(xy, float) for i, xy in enumerate([(-106, -106), (106, -106), (106, 106), (-106, 106)])}
 TRUE = np.array([153.0, 0.010, -0.006, -6e-8, 1e-12, 2e-7, -1e-7])  # c, x0, y0, k3, k5, p1, p2
 SIGMAS = np.array([0.004, 0.003, 0.003, 8e-9, 4e-13, 6e-8, 6e-8])
@@ -417,7 +417,7 @@ def draw_calibration(rng: np.random.Generator, change: Array | float = 0.0) -> C
 def test_false_alarms_come_as_often_as_stated() -> None:
     rng = np.random.default_rng(1)
     probabilities = np.array(
-        [compare([draw_calibration(rng), draw_calibration(rng)], HALF).same.probability for _ in range(160)]
+        [compare([draw_calibration(rng), draw_calibration(rng)], CORNERS).same.probability for _ in range(160)]
     )
     for level in (0.05, 0.5):
         expected = 160 * level
@@ -428,21 +428,44 @@ def test_a_trend_is_found() -> None:
     rng = np.random.default_rng(2)
     years, drift = np.array([1952.0, 1955.0, 1961.0, 1970.0]), np.zeros(7)
     drift[3] = 4e-9  # k3 a year
-    moving = compare([draw_calibration(rng, drift * (year - years[0])) for year in years], HALF, years)
+    moving = compare([draw_calibration(rng, drift * (year - years[0])) for year in years], CORNERS, years)
     assert moving.trend is not None
     assert moving.trend.freedom == moving.same.freedom / 3
     assert moving.probability < 1e-3
-    still = compare([calibration(TRUE + drift * (year - years[0])) for year in years], HALF, years)
-    ends = compare([calibration(TRUE), calibration(TRUE + drift * 18.0)], HALF)
+    still = compare([calibration(TRUE + drift * (year - years[0])) for year in years], CORNERS, years)
+    ends = compare([calibration(TRUE), calibration(TRUE + drift * 18.0)], CORNERS)
     assert still.trend_um == pytest.approx(ends.field_um[0], abs=0.05)
+
+
+def test_without_redundancy_the_standard_deviations_are_taken_as_they_are() -> None:
+    """A change of c by ten standard deviations: chi-square, in place of F, with sigma0 given beforehand."""
+    change = 10.0 * SIGMAS * np.eye(7)[0]
+    assert change[0] == 0.04
+
+    def p(change: Array, *redundancies: float) -> float:
+        pair = [calibration(TRUE), calibration(TRUE + change)]
+        given = [replace(each, redundancy=r) for each, r in zip(pair, redundancies, strict=True)]
+        return compare(given, CORNERS).same.probability
+
+    assert p(change, 0.0, 0.0) == pytest.approx(p(change, 1e9, 1e9), rel=1e-3)
+    assert p(change, 0.0, 0.0) < 1e-6
+    assert p(change, 0.0, 10.0) == p(change, 10.0, 10.0) > p(change, 0.0, 0.0)
+    assert p(0.0 * change, 0.0, 0.0) == 1.0
+
+
+def test_the_field_is_that_of_the_area_given() -> None:
+    """A digital camera's pixels lie to the right of its origin and below: none is at negative x or positive y."""
+    corners = np.array([(0.0, -24.0), (36.0, 0.0)])
+    found = compare([calibration(TRUE), calibration(TRUE)], corners)
+    np.testing.assert_allclose([found.places_mm.min(axis=0), found.places_mm.max(axis=0)], corners)
 
 
 def test_over_flat_ground_another_principal_distance_is_another_height() -> None:
     change = np.array([0.05, 0.04, 0.0, 0.0, 0.0, 0.0, 0.0])
     pair = [calibration(TRUE), calibration(TRUE + change)]
-    assert compare(pair, HALF).same.probability < 1e-6
-    assert np.abs(compare(pair, HALF, use="flat").field_um).max() < 1.0  # what the lens shifts with its point
-    assert np.abs(compare(pair, HALF).field_um).max() > 3.0
+    assert compare(pair, CORNERS).same.probability < 1e-6
+    assert np.abs(compare(pair, CORNERS, use="flat").field_um).max() < 1.0  # what the lens shifts with its point
+    assert np.abs(compare(pair, CORNERS).field_um).max() > 3.0
 
 
 @pytest.mark.parametrize(
@@ -450,7 +473,7 @@ def test_over_flat_ground_another_principal_distance_is_another_height() -> None
 )
 def test_what_cannot_be_compared_is_refused(count: int, times: tuple[float, ...] | None, words: str) -> None:
     with pytest.raises(AdjustmentError, match=words):
-        compare([calibration(TRUE)] * count, HALF, times)
+        compare([calibration(TRUE)] * count, CORNERS, times)
 
 
 def two_networks(kind: Transformation, noise: float) -> tuple[tuple[Network, Approximations], ...]:

@@ -9,13 +9,15 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from networks import lens_network
+from networks import lens_network, set_camera, set_observations, simulated
 from projects import Printed, Refusal, command, present, result_file, write_network_project
 
+from adjust import adjust
 from adjust.functional_model.families import FAMILY_NAMES, parameter_names
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.problem.parameter import Parameter
-from pipeline import read_adjustment, read_camera
+from pipeline import InputError, read_adjustment, read_camera, write_adjustment
+from pipeline.adjusting.compare_stage import run_compare
 from pipeline.cli import DONE, LOOK
 from pipeline.commands.exchanging import FAMILIES
 from pipeline.exchange.saved_cameras import save_cameras
@@ -179,6 +181,34 @@ def test_an_unchanged_camera_and_a_changed_one(project: Path, printed: Printed, 
     assert content["verdict"] == "drift"
     # A ray at 25 mm of 60 moves by 0.5 / 60 of that, less what a change of the point or the lens would not take up.
     assert np.hypot(*corner) == pytest.approx(np.hypot(25.0, 25.0) * 0.5 / 60.3 * 1e3, rel=0.1)
+
+
+def test_calibrations_are_compared_where_all_have_observations(tmp_path: Path) -> None:
+    """A digital camera counts from its first pixel, so that the area is no rectangle about 0; apart there is none."""
+    network, _ = simulated(np.random.default_rng(1), kind="none")
+    (camera,) = network.cameras
+    paths, off_mm = [tmp_path / f"{name}.json" for name in "ab"], np.array([120.0, -115.0])
+    x0, y0 = (
+        replace(given, value=given.value + off)
+        for given, off in zip((present(camera.x0_mm), present(camera.y0_mm)), off_mm, strict=True)
+    )
+    xy_mm = network.observations.xy_mm + off_mm
+    network = set_observations(set_camera(network, x0_mm=x0, y0_mm=y0), xy_mm=xy_mm)
+    adjustment = adjust(network)
+    for path in paths:
+        write_adjustment(adjustment, path)
+    found, record = run_compare(paths, None, None, "space", 0.01, None)
+    np.testing.assert_allclose(found.places_mm.min(axis=0), xy_mm.min(axis=0), atol=1e-9)
+    np.testing.assert_allclose(found.places_mm.max(axis=0), xy_mm.max(axis=0), atol=1e-9)
+    assert record.verdict == "no drift"
+    content = json.loads(paths[1].read_text())
+    for row in content["residuals"]:
+        row["camera_x_mm"] += 1000.0
+    paths[1].write_text(json.dumps(content))
+    with np.load(paths[0].with_suffix(".npz")) as arrays:
+        np.savez(paths[1].with_suffix(".npz"), **{**arrays, "fingerprint": np.array(hash_file(paths[1]))})
+    with pytest.raises(InputError, match="no part of the image was observed in all of them"):
+        run_compare(paths, None, None, "space", 0.01, None)
 
 
 def test_a_series_has_a_trend(project: Path, printed: Printed) -> None:
