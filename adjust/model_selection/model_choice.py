@@ -391,7 +391,8 @@ def given_model(network: Network) -> Model:
     distortion = network.cameras[0].distortion
     estimated = [name for name, prior in distortion.parameters.items() if prior.sigma > 0.0]
     names = tuple(name for name in parameter_names(distortion.family) if name in estimated)
-    bends = tuple((scanner.name, tuple(scanner.terms)) for scanner in network.scanners if scanner.terms)
+    # in one order, whichever the user gives, so that equal models compare as such
+    bends = tuple((scanner.name, tuple(sorted(scanner.terms))) for scanner in network.scanners if scanner.terms)
     return Model(films[0] if films else "none", distortion.family if names else "none", names, bends)
 
 
@@ -484,8 +485,10 @@ def verdict(given: Model, chosen: Candidate | None) -> str:
     if chosen is None:
         return "No model has a solution."
     text = f"Selected: {chosen.model.name}{', the given model' if chosen.model == given else ''}."
+    if chosen.redundancy <= 0:
+        return text
     low, high = (float(np.sqrt(chdtri(chosen.redundancy, above) / chosen.redundancy)) for above in (0.995, 0.005))
-    if chosen.redundancy > 0 and not low <= chosen.sigma0 <= high:
+    if not low <= chosen.sigma0 <= high:
         text += (
             f" Its sigma0 of {chosen.sigma0:.2f} is not what the given standard deviations allow, {low:.2f} to "
             f"{high:.2f}: they are not right, or no candidate is."

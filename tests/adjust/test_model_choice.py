@@ -8,6 +8,7 @@ import pytest
 
 from adjust import Distortion, Options, Prior, adjust, approximate
 from adjust.model_selection import model_choice
+from adjust.model_selection.scanner_choice import network_with_terms
 from adjust.problem.estimates import adjusted_image
 from adjust.problem.network import Network, Transformation
 from adjust.quality.critical_values import WeightFunction
@@ -62,6 +63,24 @@ def test_the_true_lens_is_chosen_and_the_simpler_ones_are_reported_to_be_too_sim
     too_simple = {reason.split(" is too simple: ")[0] for reason in choice.reasons if "too simple" in reason}
     assert too_simple == {"no distortion", "torlegard k3"}
     assert {each.model.name for each in choice.candidates} >= {"ebner", "legendre(3)"}
+
+
+def test_scanner_terms_are_one_model_in_any_order() -> None:
+    """Two equal models would be tested against each other with no degree of freedom."""
+    network = nets.bent_films([0.0, 90.0, 180.0, 270.0], {}, {})
+    models = [
+        model_choice.given_model(network_with_terms(network, {"S": terms}))
+        for terms in (("b30", "a20"), ("a20", "b30"))
+    ]
+    assert models[0] == models[1]
+    assert models[0].bends == (("S", ("a20", "b30")),)
+    assert not models[0].contains(models[1])
+
+
+def test_a_model_without_redundancy_is_named_without_bounds_of_sigma0() -> None:
+    model = model_choice.Model("affine")
+    chosen = model_choice.Candidate(model, redundancy=0, sigma0=1.0)
+    assert model_choice.verdict(model, chosen) == "Selected: affine, no distortion, the given model."
 
 
 @pytest.mark.study
