@@ -59,6 +59,16 @@ class Linearised:
         """Square root of the undamped normal equations."""
         return self.factor_nearby or factorise(self.rows.numbering, self)
 
+    @cached_property
+    def step(self) -> Array | None:
+        """Undamped step (n,) of the unknowns; None where the equations are singular in the computer's digits."""
+        step = np.zeros(len(self.rows.numbering.problem.unknowns))
+        try:
+            step[self.rows.numbering.free] = self.factor.solution
+        except np.linalg.LinAlgError:
+            return None
+        return step
+
 
 @dataclass(frozen=True)
 class Solution:
@@ -155,9 +165,9 @@ def _end(at: Linearised, history: list[Iteration]) -> Linearised | None:
     problem, length = at.rows.numbering.problem, at.factor.length()
     if length > NEGLIGIBLE_SIGMAS or not _stands_still([*history, Iteration(at.vpv, length, 0.0, 1)]):
         return None
-    step = np.zeros(len(problem.unknowns))
-    step[at.rows.numbering.free] = at.factor.solution
-    state = problem.step_state(at.state, step)
+    if at.step is None:
+        return None
+    state = problem.step_state(at.state, at.step)
     computed_mm = computed_observations(problem, state)
     if computed_mm is None:
         return None
@@ -215,8 +225,9 @@ def _step(
         try:
             factor = factorise(numbering, at, damping) if damping else at.factor
             solution = factor.solution
-        except np.linalg.LinAlgError:
-            return None
+        except np.linalg.LinAlgError:  # singular in the computer's digits, which damping mends
+            damping = 10.0 * damping or lately
+            continue
         step = np.zeros(len(problem.unknowns))
         step[numbering.free] = solution
         if np.isfinite(step).all():
@@ -238,11 +249,9 @@ def _accelerated(numbering: Numbering, covariance_mm2: Array, at: Linearised, be
     # In weakly determined directions, the second derivatives neglected with large residuals make Gauss-Newton steps
     # shrink slowly, or overshoot. The combination of the last two steps of least length replaces the step (Anderson
     # 1965, Iterative procedures for nonlinear integral equations; depth one).
-    problem, factor = numbering.problem, at.factor
-    step = np.zeros(len(problem.unknowns))
-    step[numbering.free] = factor.solution
+    problem, factor, step = numbering.problem, at.factor, at.step
     length = factor.length()
-    if not SLOW * before.sigmas < length < 1.0:
+    if step is None or not SLOW * before.sigmas < length < 1.0:
         return None
     change = (step - before.solution)[numbering.free] * factor.scale
     part = float(change @ (step[numbering.free] * factor.scale)) / float(change @ change)

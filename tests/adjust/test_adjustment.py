@@ -2,7 +2,7 @@
 
 import random
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -18,6 +18,8 @@ from scipy.io import loadmat
 from studies import parametrize_with_studies
 
 from adjust import Adjustment, Camera, Distortion, Fiducial, Network, ObjectPoint, Options, Prior, adjust, approximate
+from adjust.least_squares import iteration
+from adjust.linear_algebra.factor import Factor
 from adjust.problem.network import Approximations, Exterior, LineOfSight, Transformation
 from adjust.problem.unknowns import Reduction
 from adjust.solution.adjustment import Datum
@@ -97,6 +99,28 @@ def test_an_iteration_limit_is_reported() -> None:
     assert not result.converged
     assert "not final" in " ".join(result.warnings)
     assert "largest residuals" not in " ".join(result.warnings)
+
+
+def test_equations_that_are_singular_in_digits_are_damped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The equations at the start have no solution without damping."""
+
+    class Singular(Factor):
+        @property
+        def solution(self) -> NDArray[np.float64]:  # type: ignore[override]
+            raise np.linalg.LinAlgError("singular")
+
+    network, start = nets.simulated(np.random.default_rng(1))
+    expected, factorise, begun = adjust(network, start), iteration.factorise, list[float]()
+
+    def first_singular(*equations: Any, **options: Any) -> Factor:
+        factor = factorise(*equations, **options)
+        begun.append(factor.length())
+        return Singular(*(getattr(factor, each.name) for each in fields(factor))) if len(begun) == 1 else factor
+
+    monkeypatch.setattr(iteration, "factorise", first_singular)
+    result = adjust(network, start)
+    assert result.converged
+    np.testing.assert_allclose(result.values, expected.values, atol=1e-9)
 
 
 def test_a_mark_and_a_picture_under_two_names_are_named() -> None:
