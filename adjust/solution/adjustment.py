@@ -537,7 +537,8 @@ def _reason(first: Adjustment, last: Adjustment, frames: Sequence[str]) -> str:
     """Sentence on frames without which the others agree, or the adjustment converges."""
     who, shown = f"image{'s' * (len(frames) > 1)} {shortened(sorted(frames), NAMED)}", first.network.observations
     if not first.converged:
-        own = np.isin(shown.image, frames)
+        network = first.network
+        own = np.isin(np.array([image.frame for image in network.images])[network.image_numbers], frames)
         row = int(np.argmax(np.where(own, np.linalg.norm(first.residuals.v_mm, axis=1), -1.0)))
         return (
             f"with {who} the iteration does not converge, without it does. The largest residual there is that of "

@@ -14,6 +14,7 @@ from adjust import Adjustment, AdjustmentError, Network, Options, Parameter, Pri
 from adjust.functional_model.transformation import Film, film_kind, fit_transformation
 from adjust.problem.camera import Fiducial, FiducialDistance
 from adjust.problem.network import Image, Transformation
+from adjust.solution.adjustment import _reason
 from adjust.solution.planning import plan
 
 Array = NDArray[np.float64]
@@ -401,3 +402,14 @@ def test_a_film_that_nothing_determines_is_named_with_its_frame() -> None:
     adjustment = adjust(nets.keep_rows(network, lambda image, _, kind: (image, kind) != ("f0.right", "fiducial")))
     assert not adjustment.converged
     assert any("f0" in each.cause and "scans" in each.cause for each in adjustment.singular), adjustment.singular
+
+
+def test_the_mark_that_a_diverging_frame_in_parts_is_named_with_is_the_largest_of_its_scans() -> None:
+    network = nets.halves(np.random.default_rng(3), join_count=25).network
+    stopped = replace(adjust(network), termination="diverged")
+    lengths = np.linalg.norm(stopped.residuals.v_mm, axis=1)
+    observations = stopped.network.observations
+    lengths[[not image.startswith("f2.") for image in observations.image]] = 0.0
+    row = int(lengths.argmax())
+    sentence = _reason(stopped, stopped, ["f2"])
+    assert f"The largest residual there is that of {observations.point[row]} in {observations.image[row]}." in sentence
