@@ -38,6 +38,7 @@ from pipeline.opencv_check.opencv_calibration import (
     NAMES,
     OPENCV_RADIAL,
     Freedom,
+    NoRedundancyError,
     OpenCvCalibration,
     OpenCVPoints,
     calibrate,
@@ -226,7 +227,7 @@ def compare_corners(
     found = {image.image for image, _ in both}
     try:
         measured, own = (calibrate(each) for each in zip(*both, strict=True))
-    except cv2.error:
+    except (cv2.error, NoRedundancyError):
         return None
     pitch_mm = np.array(pictures.pitch_um[both[0][0].image]) / 1000.0
     return CornersCheck(
@@ -352,12 +353,20 @@ def _compare(
         opencv = calibrated(problem.images)
     except cv2.error as error:
         raise _NotPossible(f"OpenCV refuses these observations: {error.err}.") from None
+    except NoRedundancyError as error:
+        raise _NotPossible(
+            f"There is nothing to compare: {error}. Take more pictures, or measure more points."
+        ) from None
     sigmas_tell = rms_um > ROUNDINGS * opencv.rounding_um
     names = model_names(problem.network.cameras[0].distortion.family)
     rows = _rows(names, problem.freedom, conversion, solved.sigma0 if sigmas_tell else 1.0, opencv)
     camera = problem.network.cameras[0]
     together = solved.inseparable(camera.name)
     rows = tuple(row for row in rows if not together or row.name not in OPENCV_RADIAL)
+    if not rows:
+        raise _NotPossible(
+            f"{enumeration(together)} cannot be separated, and nothing else is free: no parameter is left to compare."
+        )
     known |= {"rms_opencv_um": opencv.rms_um, "rows": rows}
     is_digital = _is_digital(adjustment, problem)
     if pictures is not None and is_digital:
@@ -531,7 +540,8 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
         sigma_mm=sigma_mm,
         sigma_spread=float(sigmas.max() / sigmas.min()),
         gross=sum(
-            network.observations.image[row] in shown for row in np.flatnonzero(adjustment.weights < GROSS_WEIGHT)
+            network.observations.image[row] in shown and not network.observations.is_fiducial[row]
+            for row in np.flatnonzero(adjustment.weights < GROSS_WEIGHT)
         ),
         uncertain_points=sum(
             any(prior is None or prior.sigma != 0 for prior in network.point_by_id[point].priors) for point in points
@@ -570,13 +580,10 @@ def _freed(camera: Camera, distortion: Distortion, values: Mapping[str, float], 
 
 def _image_points(adjustment: Adjustment, image: str) -> tuple[OpenCVPoints, Array, list[str]]:
     """Observations of an image in the camera frame, their standard deviations (n,), and the names of the points."""
-    observations = adjustment.network.observations
+    network, observations = adjustment.network, adjustment.network.observations
     weights = adjustment.weights if len(adjustment.weights) else np.ones(len(observations))
-    rows = [
-        row
-        for row, (name, on_film) in enumerate(zip(observations.image, observations.is_fiducial, strict=True))
-        if name == image and not on_film and weights[row] >= GROSS_WEIGHT
-    ]
+    is_own = network.image_numbers == network.images.index(network.image_by_name[image])
+    rows = np.flatnonzero(is_own & ~observations.is_fiducial & (weights >= GROSS_WEIGHT))
     points = [observations.point[row] for row in rows]
     model = adjusted_image(adjustment, image)
     xyz = adjusted_places(adjustment, points)

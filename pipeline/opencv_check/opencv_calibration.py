@@ -113,6 +113,10 @@ def opencv_values(lens: Lens) -> tuple[Array, Array]:
     return np.array(values), by_lens[:-1]
 
 
+class NoRedundancyError(Exception):
+    """Observations that are no more than the parameters, so that nothing tells their standard deviations."""
+
+
 @dataclass(frozen=True)
 class OpenCVPoints:
     """One image for OpenCV: object points (n, 3) and their observations in the camera frame (n, 2), mm, y up."""
@@ -154,7 +158,7 @@ def calibrate(images: Sequence[OpenCVPoints], freedom: Freedom, start: Array) ->
     """OpenCV's least squares with initial values `start` (18,); parameters that are not in `freedom` are held.
 
     OpenCV's points are single precision. Object points are therefore reduced to their centroid and scaled to a common
-    extent, and image points are reduced to the frame. Raises cv2.error where OpenCV fails.
+    extent, and image points are reduced to the frame. Raises cv2.error where OpenCV fails, NoRedundancyError.
     """
     pixels = _Pixels.from_images(images, start)
     rounded = [each.astype(np.float32) for each in pixels.places]
@@ -187,7 +191,7 @@ def calibrate(images: Sequence[OpenCVPoints], freedom: Freedom, start: Array) ->
     rounding_px = np.concatenate([a - b for a, b in zip(pixels.places, rounded, strict=True)])
     return OpenCvCalibration(
         parameters=np.concatenate([pixels.interior_mm(matrix), values]),
-        sigmas=_sigmas([(each[:, :6], each[:, 6:]) for each in derivatives], own, float(rms_px), pixels.mm),
+        sigmas=parameter_sigmas([(each[:, :6], each[:, 6:]) for each in derivatives], own, float(rms_px), pixels.mm),
         rms_um=1e3 * pixels.mm * float(rms_px),
         rounding_um=1e3 * pixels.mm * float(np.sqrt((rounding_px**2).mean())),
     )
@@ -198,7 +202,7 @@ def calibrate_fisheye(images: Sequence[OpenCVPoints], freedom: Freedom, start: A
     held.
 
     OpenCV uses double precision; the accuracy of its solution is limited by a gradient that is not exactly 0. Raises
-    cv2.error where OpenCV fails.
+    cv2.error where OpenCV fails, NoRedundancyError.
     """
     pixels = _Pixels.from_images(images, start)
     begun = pixels.matrix(start)
@@ -223,21 +227,27 @@ def calibrate_fisheye(images: Sequence[OpenCVPoints], freedom: Freedom, start: A
     by_pose_camera = [(each[:, 8:14], each[:, [*range(8), 14]]) for each in derivatives]
     return OpenCvCalibration(
         parameters=np.concatenate([pixels.interior_mm(matrix), np.ravel(distortion), [alpha]]),
-        sigmas=_sigmas(by_pose_camera, own, float(rms_px), pixels.mm),
+        sigmas=parameter_sigmas(by_pose_camera, own, float(rms_px), pixels.mm),
         rms_um=1e3 * pixels.mm * float(rms_px),
         rounding_um=1e3 * pixels.mm * PICTURE_PX * float(np.finfo(np.float64).eps),
     )
 
 
-def _sigmas(by_pose_camera: Sequence[tuple[Array, Array]], own: Sequence[int], rms_px: float, pixel_mm: float) -> Array:
+def parameter_sigmas(
+    by_pose_camera: Sequence[tuple[Array, Array]], own: Sequence[int], rms_px: float, pixel_mm: float
+) -> Array:
     """Standard deviations (m,) of a camera's parameters from OpenCV's derivatives at its solution.
 
     OpenCV returns none of a fisheye. Its others come from normal equations, in which it drops directions that hardly
     change the residuals, such as c of a board that is never tilted.
 
     by_pose_camera: by image, derivatives (2 n, 6) by the exterior orientation and (2 n, m) by the camera's parameters;
-    own: those that are estimated.
+    own: those that are estimated. Raises NoRedundancyError.
     """
+    observations = sum(len(by_pose) for by_pose, _ in by_pose_camera)
+    redundancy = observations - 6 * len(by_pose_camera) - len(own)
+    if redundancy < 1:
+        raise NoRedundancyError(f"{observations} coordinates leave no redundancy for standard deviations")
     reduced = []
     for by_pose, by_camera in by_pose_camera:
         pose = np.linalg.qr(by_pose)[0]
@@ -245,7 +255,7 @@ def _sigmas(by_pose_camera: Sequence[tuple[Array, Array]], own: Sequence[int], r
     stacked = np.concatenate(reduced)
     scales = np.linalg.norm(stacked, axis=0)
     root = np.linalg.inv(np.linalg.qr(stacked / scales, mode="r"))
-    share = len(stacked) / (len(stacked) - 6 * len(reduced) - len(own)) / 2.0
+    share = observations / redundancy / 2.0
     sigmas = np.zeros(by_pose_camera[0][1].shape[1])
     sigmas[own] = rms_px * np.sqrt(share) * np.linalg.norm(root, axis=1) / scales
     sigmas[:4] *= pixel_mm

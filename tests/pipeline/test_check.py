@@ -8,12 +8,14 @@ import cv2
 import networks as nets
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from studies import parametrize_with_studies
 
-from adjust import Camera, Network, ObjectPoint, adjust, approximate
+from adjust import Adjustment, Camera, Network, ObjectPoint, adjust, approximate
 from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.problem.network import Transformation
 from adjust.problem.observations import Observations
+from pipeline.opencv_check import opencv_calibration
 from pipeline.opencv_check.check import check_against_opencv
 from pipeline.opencv_check.opencv_calibration import Freedom, OpenCvCalibration, calibrate, to_opencv_model
 from pipeline.results.stage_files import CameraCheck, Check
@@ -147,6 +149,23 @@ def test_what_cannot_be_checked_is_reported_with_its_reason() -> None:
     check = check_network(replace(none, cameras=(replace(none.cameras[0], distortion=NO_DISTORTION),)))
     assert check.verdict == "not possible"
     assert "No image shows enough points" in check.reason
+
+
+@pytest.mark.parametrize(("points", "share"), [(4, None), (5, 20 / 4)])
+def test_without_redundancy_there_are_no_standard_deviations(points: int, share: float | None) -> None:
+    """Two images of four points: 16 coordinates, and as many unknowns of orientations and camera.
+
+    OpenCV 5 refuses so few before; with five points a variance is 20 / 4 times the mean square.
+    """
+    rng = np.random.default_rng(1)
+    by_image = [(rng.normal(size=(2 * points, 6)), rng.normal(size=(2 * points, 4))) for _ in range(2)]
+    if share is None:
+        with pytest.raises(opencv_calibration.NoRedundancyError, match="16 coordinates leave no redundancy"):
+            opencv_calibration.parameter_sigmas(by_image, range(4), 1.0, 1.0)
+        return
+    sigmas = opencv_calibration.parameter_sigmas(by_image, range(4), 1.0, 1.0)
+    by_all = np.hstack([block_diag(*(pose for pose, _ in by_image)), np.vstack([camera for _, camera in by_image])])
+    np.testing.assert_allclose(sigmas**2, share / 2.0 * np.diag(np.linalg.inv(by_all.T @ by_all))[-4:])
 
 
 def test_unknown_points_and_different_standard_deviations_are_reported() -> None:
@@ -291,3 +310,15 @@ def test_parameters_that_cannot_be_separated_are_not_compared_one_by_one() -> No
     assert check.verdict == "agrees"
     assert {row.name for row in check.rows} == {"fx", "cx", "cy", "p1", "p2"}
     assert "cannot be separated: the radial terms are not compared one by one" in check.reason
+
+
+def test_radial_terms_alone_that_cannot_be_separated_leave_nothing_to_compare(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Adjustment, "inseparable", lambda *_: ["k1", "k2"])
+    network = nets.lens_network("opencv", np.random.default_rng(3))
+    c, x0, y0 = (Prior(value, 0.0) for value in (nets.LENSES["opencv"][0], 0.0, 0.0))
+    observations = network.observations.only(np.arange(0, len(network.observations), 15))
+    radial, network = free("opencv", "k1", "k2"), replace(network, observations=observations)
+    camera = replace(network.cameras[0], principal_distance_mm=c, x0_mm=x0, y0_mm=y0, distortion=radial)
+    check = check_against_opencv(adjust(replace(network, cameras=(camera,)))).cameras["L"]
+    assert check.verdict == "not possible"
+    assert "k1 and k2 cannot be separated, and nothing else is free" in check.reason
