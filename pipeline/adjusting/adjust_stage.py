@@ -16,6 +16,7 @@ from adjust.model_selection.model_choice import Choice, choose
 from adjust.model_selection.scanner_choice import bent_network, choose_bends
 from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.problem.network import Network
+from adjust.problem.observations import Observations
 from adjust.solution.adjustment import Options, adjust, adjust_unmodelled
 from adjust.solution.result import Adjustment
 from measure.results import ON_FILM
@@ -118,20 +119,22 @@ def _correct_eccentricity(
     project: Project, adjustment: Adjustment, options: Options
 ) -> tuple[Adjustment, tuple[str, ...]]:
     """Iterate adjustment and correction of disks; also return a remark on eccentricities that are not corrected."""
-    network = adjustment.network  # without images that were left out
-    observations = network.observations
-    sigmas_mm = np.sqrt(np.diagonal(observations.covariance_mm2, axis1=1, axis2=2))
     normals = project.given_points.normals if project.given_points else {}
-    applied = uncorrected = np.zeros_like(observations.xy_mm)
+    measured_mm = adjustment.network.observations.xy_mm
+    applied = uncorrected = np.zeros_like(measured_mm)
+    sigmas_mm = np.ones_like(measured_mm)
     for _ in range(_ROUNDS):
         if not adjustment.converged:
             break
+        observations = adjustment.network.observations  # of each round, which may leave out images and points
+        sigmas_mm = np.sqrt(np.diagonal(observations.covariance_mm2, axis1=1, axis2=2))
         wanted, uncorrected = _eccentricities(adjustment, normals, project.disk_radius)
         if np.max(np.abs(wanted - applied) / sigmas_mm, initial=0.0) < _SETTLED_SIGMAS:
             break
-        applied = wanted
-        shifted = replace(network, observations=replace(observations, xy_mm=observations.xy_mm - applied))
+        shifted = replace(adjustment.network, observations=replace(observations, xy_mm=measured_mm - wanted))
         corrected = adjust(shifted, options=options)
+        kept = _rows_of(observations, corrected.network.observations)
+        measured_mm, applied = measured_mm[kept], wanted[kept]
         adjustment = replace(corrected, left_out={**adjustment.left_out, **corrected.left_out})
     worst = float(np.max(np.abs(uncorrected) / sigmas_mm, initial=0.0))
     if worst <= _NOTICEABLE_SIGMAS:
@@ -142,6 +145,15 @@ def _correct_eccentricity(
         "smaller disks."
     )
     return adjustment, (remark,)
+
+
+def _rows_of(observations: Observations, some: Observations) -> list[int]:
+    """Rows of some of the observations."""
+    rows = {
+        mark: row
+        for row, mark in enumerate(zip(observations.image, observations.point, observations.kind, strict=True))
+    }
+    return [rows[mark] for mark in zip(some.image, some.point, some.kind, strict=True)]
 
 
 def _eccentricities(adjustment: Adjustment, given: Mapping[str, Array], radius: float) -> tuple[Array, Array]:

@@ -23,6 +23,7 @@ from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.network import EXTERIOR_NAMES, Transformation
 from pipeline import InputError, build_network, read_adjustment, read_comparator, read_project, write_adjustment
+from pipeline.adjusting import adjust_stage
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.cli import DONE, LOOK
 from pipeline.opencv_check.check import check_against_opencv
@@ -362,6 +363,34 @@ def bent_project(folder: Path) -> Path:
     project = projects.write_network_project(network, folder)
     projects.replace_text(project, "[object]\n", '[object]\nunit = "mm"\nboard_bend = "free"\n')
     return project
+
+
+def test_eccentricities_are_corrected_where_a_round_leaves_out_an_image(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The result is that of the project without this image from the beginning."""
+    simulated, _ = nets.simulated(np.random.default_rng(1), points=nets.field_points(np.random.default_rng(2), 30, 0.0))
+    path = write_network(simulated, tmp_path)
+    path.write_text(path.read_text() + '[targets]\nkind = "disk"\ndiameter_mm = 30000.0\n')
+    project = read_project(path)
+    marks, every = read_comparator(project.comparator), adjust_stage.adjust
+    expected = adjust_marks(project, [mark for mark in marks if mark.image != "f3"])
+    rounds = list[nets.Network]()
+
+    def without_f3(network: nets.Network, **options: Any) -> Adjustment:
+        rounds.append(network)
+        rest = [row for row, image in enumerate(network.observations.image) if image != "f3"]
+        images = tuple(image for image in network.images if image.name != "f3")
+        left = replace(network, images=images, observations=network.observations.only(np.array(rest)))
+        return every(network if len(rounds) == 1 else left, **options)
+
+    monkeypatch.setattr(adjust_stage, "adjust", without_f3)
+    found = adjust_marks(project, marks)
+    assert len(rounds) > 1
+    assert found.parameters == expected.parameters
+    sigmas = np.array([expected.sigma(each) for each in expected.parameters])
+    is_free = sigmas > 0.0
+    assert (np.abs(found.values - expected.values)[is_free] < 1e-4 * sigmas[is_free]).all()
 
 
 def test_a_bent_board_from_the_project_file_to_the_report(tmp_path: Path) -> None:
