@@ -2,7 +2,9 @@
 
 import io
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Mapping
+from itertools import chain
 
 import numpy as np
 
@@ -111,10 +113,14 @@ def _transformations(adjustment: AdjustmentRecord, block: ImageBlock) -> Iterabl
 
 def _covariances(block: ImageBlock) -> Iterable[Row]:
     """Covariances of each image's orientation and film: lower triangle; mm, object units and rad."""
-    of_image: dict[str, list[Parameter]] = {}
-    for each in block.covariance.parameters:
-        if each.kind in ("exterior", "film"):
-            of_image.setdefault(each.owner, []).append(each)
+    scans, of_image = defaultdict[str, list[str]](list), defaultdict[str, list[Parameter]](list)
+    for frame in block.frames:
+        scans[block.project.image_frame(frame.image)].append(frame.image)
+    covariances = (block.covariance, *block.covariance.images)
+    for each in chain.from_iterable(covariance.parameters for covariance in covariances):
+        if each.kind in ("exterior", "film"):  # scans of one frame have one orientation, and films of their own
+            for image in scans[each.owner] if each.kind == "exterior" else [each.owner]:
+                of_image[image].append(each)
     for frame in block.frames:
         own = of_image.get(frame.image, [])
         matrix = block.covariance.select(own)

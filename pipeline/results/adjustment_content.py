@@ -83,10 +83,12 @@ def joined_frames(adjustment: Adjustment) -> dict[str, JoinedFrameRecord]:
     joins = defaultdict[str, list[JoinRecord]](list)
     for (frame, point), rows in network.joins.items():
         if frame in parts:
-            names = tuple(network.observations.image[row] for row in rows)
-            first, second = (camera_mm[row] for row in rows.tolist())
-            apart_um, middle = UM_PER_MM * (second - first), (first + second) / 2.0
-            joins[frame].append(JoinRecord(point, names, *middle.tolist(), *apart_um.tolist()))
+            begun, *others = rows.tolist()
+            for other in others:  # more than one where three scans or more show the point
+                names = tuple(network.observations.image[row] for row in (begun, other))
+                first, second = camera_mm[begun], camera_mm[other]
+                apart_um, middle = UM_PER_MM * (second - first), (first + second) / 2.0
+                joins[frame].append(JoinRecord(point, names, *middle.tolist(), *apart_um.tolist()))
     return {frame: JoinedFrameRecord(own, tuple(joins[frame]), tuple(marks[frame])) for frame, own in parts.items()}
 
 

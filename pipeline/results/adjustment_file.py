@@ -37,6 +37,7 @@ class ParameterCovariance:
     adjustment : fingerprint of the adjustment.json to which it belongs; "" if the file has none.
     clusters : jackknife covariance of camera parameters, leaving out one image at a time, for correlated errors within
         images; None if it was not computed.
+    images : of a large network, whose matrix lacks the quantities of images: those of each image by themselves.
     """
 
     parameters: tuple[Parameter, ...]
@@ -44,14 +45,21 @@ class ParameterCovariance:
     matrix: Array
     adjustment: str = ""
     clusters: "ParameterCovariance | None" = None
+    images: "tuple[ParameterCovariance, ...]" = ()
 
     def select(self, parameters: Iterable[Parameter | str]) -> Array:
-        """Covariance (k, k) of unknowns given by keys or by their texts in the file; zero for fixed ones, which the
-        file does not list."""
-        at = np.array([self._positions.get(as_parameter(each), -1) for each in parameters], dtype=int)
+        """Covariance (k, k) of unknowns given by keys or by their texts in the file.
+
+        It is zero for fixed ones, which the file does not list, and where a large network's file does not hold it.
+        """
+        keys = [as_parameter(each) for each in parameters]
+        at = np.array([self._positions.get(key, -1) for key in keys], dtype=int)
         block: Array = self.matrix[np.ix_(at, at)]
         block[at < 0, :] = 0.0
         block[:, at < 0] = 0.0
+        for image in {self._image_of[key] for key in keys if key in self._image_of}:
+            own = [i for i, key in enumerate(keys) if self._image_of.get(key) == image]
+            block[np.ix_(own, own)] = self.images[image].select(keys[i] for i in own)
         return block
 
     def select_larger(self, parameters: Sequence[Parameter]) -> Array:
@@ -69,6 +77,10 @@ class ParameterCovariance:
     @cached_property
     def _positions(self) -> dict[Parameter, int]:
         return {each: i for i, each in enumerate(self.parameters)}
+
+    @cached_property
+    def _image_of(self) -> dict[Parameter, int]:
+        return {each: i for i, image in enumerate(self.images) for each in image.parameters}
 
 
 def write_adjustment(
@@ -158,7 +170,26 @@ def read_covariance(path: Path) -> ParameterCovariance:
     if b"cluster_names.npy" in data:
         keys, scatter = _named_matrix(data, "cluster_", file)
         clusters = ParameterCovariance(keys, np.full(len(keys), np.nan), scatter, adjustment)
-    return ParameterCovariance(parameters, values.astype(np.float64), matrix, adjustment, clusters)
+    images = _images(data, file) if b"image_names.npy" in data else ()
+    return ParameterCovariance(parameters, values.astype(np.float64), matrix, adjustment, clusters, images)
+
+
+def _images(data: bytes, file: Path) -> tuple[ParameterCovariance, ...]:
+    """Read the covariances of images that stand by themselves. Raises InputError if shapes or types do not match."""
+    names, values, matrices = (_array(data, f"image_{name}", file) for name in ("names", "values", "matrices"))
+    fits = names.ndim == 2 and values.shape == names.shape and matrices.shape == (*names.shape, names.shape[-1])
+    if not fits or (names.dtype.kind, values.dtype.kind, matrices.dtype.kind) != ("U", "f", "f"):
+        shapes = f"{names.shape}, {values.shape} and {matrices.shape}"
+        raise InputError(f"{file}: names, values and matrices of images do not fit one another: {shapes}. {AGAIN}")
+    blocks = []
+    for own, value, matrix in zip(names, values, matrices, strict=True):
+        count = int(np.count_nonzero(own != ""))
+        try:
+            parameters = parameters_from_texts([str(name) for name in own[:count]])
+        except ValueError as error:
+            raise InputError(f"{file}: {error}. {AGAIN}") from None
+        blocks.append(ParameterCovariance(parameters, value[:count], matrix[:count, :count]))
+    return tuple(blocks)
 
 
 def _named_matrix(data: bytes, prefix: str, file: Path) -> tuple[tuple[Parameter, ...], Array]:

@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import made_up_calibration
+import networks as nets
 import numpy as np
 import pytest
 
-from adjust import Adjustment, ObjectPoint, Prior
+from adjust import Adjustment, ObjectPoint, Prior, adjust
+from adjust.problem.network import Image
 from adjust.quality.run import Residuals
 from pipeline import InputError, read_adjustment, write_adjustment
 from pipeline.results import adjustment_content, stage_files
@@ -207,7 +209,35 @@ def test_a_large_network_is_in_blocks(adjustment: Adjustment, path: Path, monkey
                     listed = [str(name) for name in names if name]
                     np.testing.assert_array_equal(matrix[: len(listed), : len(listed)], whole.select(listed))
                     assert not matrix[len(listed) :].any()
+                    if kind == "image":
+                        np.testing.assert_array_equal(covariance.select(listed), whole.select(listed))
             assert arrays["point_names"].shape == (24, 3)
+    exterior = [f"EO.{image}.Z0" for image in ("f1", "f2")]  # each with the camera, and with the other: not in the file
+    variances = np.diag(whole.select(exterior))
+    np.testing.assert_array_equal(covariance.select([*exterior, cameras[0]])[:2, :2], np.diag(variances))
+    np.testing.assert_array_equal(covariance.select([*exterior, cameras[0]])[2, :2], 0.0)
+    with np.load(covariance_path(path)) as arrays:
+        np.savez(covariance_path(path), **{**arrays, "image_values": arrays["image_values"][:-1]})
+    with pytest.raises(InputError, match=r"names, values and matrices of images do not fit one another"):
+        read_covariance(path)
+
+
+def test_a_join_in_three_scans_has_two_differences_to_the_first() -> None:
+    """The right half of a frame is scanned twice, with the same errors."""
+    made = nets.halves(np.random.default_rng(3), join_count=25).network
+    observations = made.observations
+    rows = [row for row, image in enumerate(observations.image) if image == "f0.right"]
+    order = [*range(len(observations)), *rows]
+    again = observations.only(np.array(order))
+    again = replace(again, image=(*observations.image, *["f0.again"] * len(rows)))
+    images = (*made.images, Image("f0.again", "K", "affine", part_of="f0"))
+    frame = adjustment_content.joined_frames(adjust(replace(made, images=images, observations=again)))["f0"]
+    first = [row for row in frame.joins if row.images == ("f0.left", "f0.right")]
+    second = [row for row in frame.joins if row.images == ("f0.left", "f0.again")]
+    assert len(first) == len(second) == 25
+    assert len(frame.joins) == 50
+    np.testing.assert_allclose([row.dx_um for row in first], [row.dx_um for row in second], atol=1e-6)
+    assert 1.0 < np.std([row.dx_um for row in first]) < 5.0  # each scan has 2 um
 
 
 def test_a_check_is_read_as_it_was_written_and_a_wrong_value_refused_with_its_place(tmp_path: Path) -> None:

@@ -58,6 +58,7 @@ from pipeline.exchange.geojson_format import lon_lat
 from pipeline.exchange.pinhole import frame_corners_mm
 from pipeline.exchange.tables import _check_words
 from pipeline.files.camera_file import CameraFile, read_camera
+from pipeline.results import adjustment_content
 from pipeline.text.files import file_word, path_below
 from synthetic_images.projection import camera_from_object, object_rotation
 from synthetic_images.scene import Family, SceneCamera
@@ -93,6 +94,25 @@ def test_a_frame_in_parts_is_one_picture(format: str, tmp_path: Path) -> None:
         model = pycolmap.Reconstruction(str(folder / "sparse"))
         assert sorted(image.name for image in model.images.values()) == [f"f{i}.tif" for i in range(4)]
         assert {len(image.points2D) for image in model.images.values()} == {len(xyz)}
+
+
+@pytest.mark.parametrize("affordable", [3000, 10])
+def test_covariances_of_scans_in_parts_and_of_large_networks_are_exported(
+    affordable: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both scans of a frame have its orientation; beyond some quantities those of an image stand by themselves."""
+    monkeypatch.setattr(adjustment_content, "AFFORDABLE", affordable)
+    made = halves(np.random.default_rng(3), join_count=25)
+    text = (exported(make_project(made.network, tmp_path), "csv", tmp_path) / "covariances.csv").read_text()
+    rows = list(csv.DictReader(text.splitlines()[1:]))
+    images = result_file(tmp_path)["images"]
+    for name, image in images.items():
+        frame, own = name.split(".")[0], [row for row in rows if row["image"] == name]
+        (variance,) = (float(row["covariance"]) for row in own if row["first"] == row["second"] == f"EO.{frame}.Z0")
+        assert variance == pytest.approx(image["exterior"]["Z0"]["sigma"] ** 2, rel=1e-9)
+        (variance,) = (float(row["covariance"]) for row in own if row["first"] == row["second"] == f"T.{name}.a1")
+        assert variance == pytest.approx(image["transformation"]["a1"]["sigma"] ** 2, rel=1e-9)
+    assert len(images) == 8
 
 
 @pytest.mark.parametrize("format", PINHOLES)
