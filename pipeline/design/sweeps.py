@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.design.expected import Expected, expect
 from pipeline.design.setup import Setup, scene_setup
 from pipeline.errors import InputError
+from pipeline.files.library import camera_path
 from pipeline.rendered.scene_file import parse_scene
 from pipeline.rendered.scene_tables import Sweep
 from pipeline.text.toml_tables import Table, read_toml
@@ -48,8 +49,9 @@ class Variations:
     def read(path: Path) -> "Variations":
         """Read a scene file. Raises InputError."""
         values = copy.deepcopy(dict(read_toml(path, "scene.toml").values))
-        if "field" in values:  # otherwise it is no scene, and is refused with the keys that it has
-            values.setdefault("scan", {}).setdefault("pitch_um", PLANNING_PITCH_UM)
+        # Without a field it is no scene, and is refused with the keys that it has; so is a scan that is no table.
+        if "field" in values and isinstance(scan := values.setdefault("scan", {}), dict):
+            scan.setdefault("pitch_um", PLANNING_PITCH_UM)
         return Variations(path, values)
 
     def setup(self, layout: int = 0) -> Setup:
@@ -73,7 +75,7 @@ class Variations:
         values = copy.deepcopy(self.values)
         parts = quantity.split(".")
         if parts[0] == "camera" and isinstance(values.get("camera"), str):
-            camera = copy.deepcopy(dict(read_toml(self.path.parent / values["camera"]).values))
+            camera = copy.deepcopy(dict(read_toml(camera_path(values["camera"], self.path.parent)).values))
             for table in (camera, *camera.get("fiducial", [])):
                 table.pop("mark", None)  # the drawings of the marks are not needed here
             values["camera"] = camera

@@ -152,6 +152,9 @@ def test_points_and_cameras_of_other_files_can_be_varied_and_natural_points_not(
     sweep = Sweep(quantity="camera.principal_distance_mm", values=(210.0, 300.0))
     varied = Variations.read(SCENES / "aerial_five.toml").varied(1, sweep, 210.0).setup()
     assert (varied.lens.principal_distance_mm, len(varied.camera.fiducials)) == (210.0, 8)
+    camera = SMALL[SMALL.index("[camera]") : SMALL.index("[field]")]
+    scene = small(tmp_path, (camera, 'camera = "library:wild-rc8-153"\n'))
+    assert Variations.read(scene).varied(1, sweep, 210.0).setup().lens.principal_distance_mm == 210.0
     with pytest.raises(InputError, match="has no targets"):
         scene_setup(read_scene(SCENES / "juhl_natural.toml"))
 
@@ -190,6 +193,12 @@ def test_a_wrong_quantity_is_reported_with_what_is_near(tmp_path: Path, quantity
 def test_a_wrong_table_is_reported(tmp_path: Path, refusal: Refusal, line: str, words: str) -> None:
     assert words in refusal("design", small(tmp_path, ("[[image]]", f"{line}\n[[image]]")))
     assert not (tmp_path / "small-design").exists()
+
+
+def test_a_scan_that_is_no_table_is_refused(tmp_path: Path, refusal: Refusal) -> None:
+    scene = small(tmp_path)
+    scene.write_text("scan = 3\n" + scene.read_text())
+    assert "scan" in refusal("design", scene)
 
 
 def test_fiducials_of_photographs_alone_are_the_mean_of_as_many(tmp_path: Path) -> None:
