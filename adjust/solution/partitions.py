@@ -254,10 +254,13 @@ def _single_points(normal: Array, right: Array, vpv: float, redundancy: float) -
 
 
 def _lines(xyz: Array, axes: Array) -> Iterator[tuple[str, Mask]]:
-    """Masks of the lines of a regular field along its axes, and of all points beyond each, with words."""
-    along = (xyz - xyz.mean(axis=0)) @ axes.T
+    """Masks of the lines of a regular field along its axes, and of all points beyond each or a diagonal, with words."""
+    diagonals = np.array([axes[0] + axes[1], axes[0] - axes[1]])
+    along = (xyz - xyz.mean(axis=0)) @ np.vstack([axes, diagonals]).T
     extent = float(np.ptp(along, axis=0).max())
-    for axis, what in product(range(len(axes)), ("line", "beyond")):
+    for axis, what in product(range(along.shape[1]), ("line", "beyond")):
+        if what == "line" and axis >= len(axes):
+            continue
         order = np.sort(along[:, axis])
         ends = np.flatnonzero(np.diff(order) > SAME_LINE * extent)
         places = [float(part.mean()) for part in np.split(order, ends + 1)]

@@ -244,6 +244,18 @@ def test_a_film_that_did_not_converge_has_no_marks_outside_the_picture() -> None
     assert outside == [True, False]
 
 
+def test_a_boards_corner_that_is_bent_up_is_named_by_its_points() -> None:
+    """It was taken for a bend and a twist of the whole board."""
+    made = faults.scene(8, flat=True)
+    given = faults.misfit_network(made, faults.Effects(), SOUND, np.random.default_rng(2))
+    along = (made.points[:, :2] / np.ptp(made.points[:, :2], axis=0)).sum(axis=1)
+    corner = {f"PT.p{k}.Z" for k in np.argsort(-along, kind="stable")[:6]}
+    bent = nets.map_priors(given, lambda name, prior: replace(prior, value=prior.value + 3.0 * (name in corner)))
+    (found,) = adjust(bent).explanations
+    assert "(all on one side of a line) are not where they are given" in found.cause
+    assert {f"PT.{name}.Z" for name in re.findall(r"p\d+", found.cause)} == corner
+
+
 def test_a_block_of_points_that_is_raised_is_named_whole_with_its_one_shift() -> None:
     """The first of two rounds names some of them, with estimates that the others spoil."""
     rng = np.random.default_rng(3)
