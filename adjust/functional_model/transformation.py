@@ -12,6 +12,9 @@
 Parameters are (..., k), coordinates (..., 2). The adjustment estimates the parameters of (x - center) / half, with the
 centre and half the extent of an image's observations: the columns are nearly dependent otherwise. m is given for
 congruent, similarity and conformal; the parameters of the others include mirroring.
+
+A new one also needs its terms in `measure.fiducials.interior_orientation.film_terms` and an entry in
+`adjust.model_selection.model_choice.TRANSFORMATIONS`.
 """
 
 import re

@@ -1,4 +1,8 @@
-"""Normalised cross-correlation (NCC) with a mark's template under a mask, after background subtraction; its peaks."""
+"""Normalised cross-correlation (NCC) with a mark's template under a mask, after background subtraction; its peaks.
+
+No limit is set here: candidates in `responses`, single marks by their false alarms in `localisation` (limit in
+`measure.flags`), targets in `targets.identification`, fits by their likeness in `measure_frame`.
+"""
 
 from dataclasses import dataclass, replace
 

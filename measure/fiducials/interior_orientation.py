@@ -10,6 +10,7 @@ from measure.array_types import Array
 AFFINITY_SIGMA = 5e-3  # relative stretch: a few parts in ten thousand by film, several thousandths by an office scanner
 _LINEAR = [0, 1, 4, 5]  # indices of the unknowns of the affine model without the shift
 _FREE = 0.03  # fraction of the frame's radius: prior standard deviation of free stretch, shear and film terms
+_WITHIN_AFFINE = ("none", "congruent", "similarity", "affine")  # film models without terms beyond an affine one
 _INVERSIONS = 6  # iterations of the inversion of a perspective, each correction a fiftieth of the one before
 
 
@@ -23,10 +24,16 @@ def film_terms(model: str, places: Array, measured: Array | None = None) -> Arra
 
     Parameters
     ----------
-    model : projective, bilinear, conformal(n) or polynomial(n); any other has no further terms.
+    model : projective, bilinear, conformal(n) or polynomial(n); the models in `_WITHIN_AFFINE`, and those of order 1,
+        have no further terms.
     places : (n, 2) given places.
     measured : (n, 2) measured places, with which the equations of a projective transformation are linear (DLT). None:
         it is linearised.
+
+    Raises
+    ------
+    ValueError
+        If the model is not known: marks would be tested against plain affine film.
     """
     x, y = places.T
     u, v = places.T if measured is None else measured.T
@@ -37,13 +44,16 @@ def film_terms(model: str, places: Array, measured: Array | None = None) -> Arra
         return interleaved((u * x, v * x), (u * y, v * y))
     if name == "bilinear":
         return interleaved((x * y, none), (none, x * y))
+    if name in _WITHIN_AFFINE or (name in ("conformal", "polynomial") and order == "1"):
+        return np.zeros((2 * len(places), 0))
     if name == "conformal" and powers:
         z = [(x + 1j * y) ** power for power in powers]
         return interleaved(*[(each.real, each.imag) for each in z], *[(-each.imag, each.real) for each in z])
     if name == "polynomial" and powers:
         terms = [x ** (degree - q) * y**q for degree in powers for q in range(degree + 1)]
         return interleaved(*[(each, none) for each in terms], *[(none, each) for each in terms])
-    return np.zeros((2 * len(places), 0))
+    known = ", ".join((*_WITHIN_AFFINE, "projective", "bilinear", "conformal(n)", "polynomial(n)"))
+    raise ValueError(f"the film model is {model!r}; one of {known} is right")
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,14 +89,12 @@ class FrameFit:
     ----------
     up_from_camera : (2, 3) affine transformation from camera mm to the scan's mm (right, up); the best approximation
         where a film model has further terms.
-    residuals_mm : (n, 2) measured less predicted.
     chi_square, redundancy : including the pseudo-observations of affinity and film terms.
     linear_sigma : rms of the standard deviations of rotation (rad), scale, stretch and shear.
     film : transformation with a film model; None for an affine one.
     """
 
     up_from_camera: Array
-    residuals_mm: Array
     chi_square: float
     redundancy: int
     linear_sigma: float
@@ -110,18 +118,18 @@ def fit_frame(camera_mm: Array, up_mm: Array, sigma_mm: Array, turn: Array, mode
     unit, measured = given / radius_mm, (up_mm - center_mm) / radius_mm
     terms = film_terms(model, unit, measured)
     if terms.shape[1]:
-        solution, inverse, chi_square, _ = _solve(unit, measured, sigma_mm / radius_mm, terms, _FREE)
+        solution, inverse, chi_square = _solve(unit, measured, sigma_mm / radius_mm, terms, _FREE)
         affine = np.column_stack([_linear(solution, np.eye(2)), solution[2:4]])
         film = FilmFit(model, turn, radius_mm, center_mm, affine, solution[6:])
         places = film.places_mm(camera_mm)
         design = np.column_stack([camera_mm, np.ones(len(camera_mm))])
         best = np.linalg.lstsq(design, places, rcond=None)[0].T if np.linalg.matrix_rank(design) == 3 else affine
-        up_from_camera, residuals = np.asarray(best, dtype=np.float64), up_mm - places
+        up_from_camera = np.asarray(best, dtype=np.float64)
     else:
-        solution, inverse, chi_square, residuals = _solve(given, up_mm, sigma_mm, terms, AFFINITY_SIGMA)
+        solution, inverse, chi_square = _solve(given, up_mm, sigma_mm, terms, AFFINITY_SIGMA)
         up_from_camera = np.column_stack([_linear(solution, turn), solution[2:4]])
     sigma = float(np.sqrt(np.sum(inverse[_LINEAR] ** 2, axis=1).mean()) / np.hypot(*solution[:2]))
-    return FrameFit(up_from_camera, residuals, chi_square, 2 * len(camera_mm) - 4, sigma, film)
+    return FrameFit(up_from_camera, chi_square, 2 * len(camera_mm) - 4, sigma, film)
 
 
 def _linear(solution: Array, turn: Array) -> Array:
@@ -132,8 +140,8 @@ def _linear(solution: Array, turn: Array) -> Array:
 
 def _solve(
     given: Array, measured: Array, sigma: Array, terms: Array, affinity_sigma: float
-) -> tuple[Array, Array, float, Array]:
-    """Least squares with pseudo-observations: solution, pseudo-inverse of the design, chi-square, residuals (n, 2)."""
+) -> tuple[Array, Array, float]:
+    """Least squares with pseudo-observations: solution, pseudo-inverse of the design, chi-square."""
     x, y = given.T
     one, none = np.ones_like(x), np.zeros_like(x)
     rows = np.concatenate([np.stack([x, -y, one, none, x, y], axis=1), np.stack([y, x, none, one, -y, x], axis=1)])
@@ -147,5 +155,4 @@ def _solve(
     size = np.linalg.norm(design, axis=0)
     inverse = np.linalg.pinv(design / size) / size[:, None]
     solution = inverse @ right
-    residuals = (values - rows @ solution).reshape(2, -1).T
-    return solution, inverse, float(np.sum((design @ solution - right) ** 2)), residuals
+    return solution, inverse, float(np.sum((design @ solution - right) ** 2))

@@ -123,6 +123,7 @@ class FiducialOptions:
         for name in ("rotation_deg", "scale_tolerance", "misfit_mm", "affinity", "gate_mm", "film_sigma_mm"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; a positive number is right")
+        film_terms(self.film_model, np.zeros((1, 2)))  # raises ValueError for a model that is not known
 
     def search_mm(self, layout: FiducialLayout) -> float:
         """Largest deviation of a mark of the layout from its given place in the search."""

@@ -1,6 +1,8 @@
 """Drawings of fiducial marks: unions of simple shapes in mm relative to the measured point, x right and y up.
 
-The kinds (cross, dot, ...) are shorthands that return parts; all other modules use parts only.
+The kinds (cross, dot, ...) are shorthands that return parts; all other modules use parts only. A new kind also needs a
+table in `pipeline.files.mark_table.MARK_TABLES`, a start in `pipeline.review.drawing_view.first_drawing`, and an entry
+in `pipeline.files.library.MARK_KINDS`.
 """
 
 import math
@@ -21,6 +23,9 @@ LEARNED_ORIGIN = 0.25  # fraction of a learned mark's size: standard deviation o
 MOST_GIVEN_SIGMA_MM = 0.1  # mm, limit of a given place's sigma: a datum may state 1 mm although the place is better
 _CORNER_RAD = np.deg2rad(30.0)  # rad, smallest turn of a corner; the vertices of an arc turn by less
 _SEARCHED = 0.3  # fraction of a frame corner's reach: side of the square used as its template
+_EDGE_MM = 0.1  # mm, tolerance within which a drawing ends on the frame's edge
+_TO_NEXT = 0.45  # fraction of the distance to the next mark: longer arms are continuous lines
+_LINE_WIDTHS = 5.0  # in line widths, half side of the square used around a crossing
 
 
 @dataclass(frozen=True)
@@ -363,10 +368,6 @@ def finest_detail_mm(mark: Mark) -> float:
 #
 # A réseau of continuous lines is drawn as crosses whose arms reach to the next ones. A crossing is determined by the
 # lines close to it; farther parts take computing time and meet stars.
-
-_EDGE_MM = 0.1  # mm, tolerance within which a drawing ends on the frame's edge
-_TO_NEXT = 0.45  # fraction of the distance to the next mark: longer arms are continuous lines
-_LINE_WIDTHS = 5.0  # in line widths, half side of the square used around a crossing
 
 
 def limit_to_frame(layout: FiducialLayout) -> FiducialLayout:

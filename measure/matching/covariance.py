@@ -8,10 +8,12 @@ from scipy.linalg import eigh
 from scipy.ndimage import gaussian_filter
 
 from measure.array_types import Array, Mask
+from measure.flags import Cause
 from measure.geometry import linear_scale
 from measure.marks.rendering import render
 from measure.marks.shapes import MarkTemplate
 from measure.marks.templates import GRAIN_PX, SMOOTHED_PX2
+from measure.matching.gauss_newton import PictureFit
 from measure.matching.models import GREY
 from measure.noise.noise_model import (
     SCALE_VARIANCE,
@@ -237,6 +239,28 @@ class Landscape:
         # Noise of single pixels is accounted for elsewhere; the covariance of neighbours is the texture.
         lags[reach, reach] = max(lags[reach, reach + 1], 0.0)
         return _covariance_by_texture(by_grey * self.share, lags)
+
+
+def place_covariance(fit: PictureFit, linear: LinearFit, covariance: Array, landscape: Landscape) -> Covariance:
+    """Covariance of the place by its causes. covariance (unknowns, unknowns): by noise, rounding included."""
+    model, by_grey, by_noise = fit.model, linear.by_grey, covariance[:2, :2]
+    rounded = fit.rounding_variance_dn2 * np.trace(products(by_grey[:2], by_grey[:2]))
+    share = min(float(rounded / np.trace(by_noise)), 1.0)
+    place = Covariance.from_noise((1 - share) * by_noise).plus(Cause.ROUNDING, share * by_noise)
+    priors_dn2 = model.prior_weights * linear.noise.variance_dn2
+    more = second_order(model.design, model.slopes, fit.used, covariance, priors_dn2)
+    place = place.plus(Cause.SECOND_ORDER, more * by_noise)
+    if isinstance(model.mark, MarkTemplate) and model.mark.steadiness is not None:
+        change = fit.contrast_dn / float(np.ptp(model.mark.image))
+        place = place.plus(Cause.CHANGED_TONES, covariance_of_changed_tone(model.half_tones, by_grey, change))
+    place = place.plus(Cause.LANDSCAPE, landscape.covariance(by_grey[:2]))
+    place = place.plus(Cause.UNLIKE_DRAWING, linear.unlike_drawing_px2(by_noise))
+    place = place.plus(Cause.DAMAGE, linear.damage_px2(fit.area & ~fit.used))
+    halves = linear.halves_px2(fit.area & model.tells, fit.state.pixel_from_mark[:, 2])
+    place = place.plus(Cause.UNLIKE_DRAWING, halves)
+    if not model.is_chip and model.background_px is None:
+        place = place.plus(Cause.TEXTURE, linear.texture_px2(fit.area & model.tells))
+    return place
 
 
 def _smooth(images: Array, sigma_px: float) -> Array:

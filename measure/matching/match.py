@@ -13,17 +13,15 @@ from typing import Any
 import numpy as np
 
 from measure.array_types import Array, Mask
-from measure.flags import Cause
 from measure.marks.rendering import frame_pixel_mask, known_mask, mark_window, picture
-from measure.marks.shapes import Mark, MarkShape, MarkTemplate, widen_lines
+from measure.marks.shapes import Mark, MarkShape, widen_lines
 from measure.matching.covariance import (
     Landscape,
     LinearFit,
-    covariance_of_changed_tone,
     edge_place,
     line_width,
     own_shape,
-    second_order,
+    place_covariance,
     sloping_place,
 )
 from measure.matching.gauss_newton import EDGE_BLURS, PictureFit
@@ -31,11 +29,10 @@ from measure.matching.models import GREY, FitState, MatchOptions, PictureModel, 
 from measure.matching.tone_information import mark_tone_information, sharpening_score
 from measure.matching.window import ScanWindow
 from measure.noise.grain import blank_patches, grain_model, is_coloured
-from measure.noise.noise_model import NoiseModel, as_if_white, combined, factors, is_textured, products
+from measure.noise.noise_model import NoiseModel, as_if_white, combined, factors, is_textured
 from measure.results import Covariance, MarkFit
 
 __all__ = ["MarkFit", "MatchOptions", "match"]
-
 
 _WIDER = 1.05  # relative width of lines, step of the difference
 _SPARE_PX = 2.0  # px beyond the margin, so that the mark can move
@@ -204,7 +201,7 @@ def _precision(fit: PictureFit, noise: NoiseModel, landscape: Landscape) -> dict
     if blur is not None and not model.blur_is_at_limit:
         blur_sigma = float(sigmas[blur]) / (2 * model.total_blur_px**2)
     return {
-        "place_covariance": _place_covariance(fit, linear, covariance, landscape),
+        "place_covariance": place_covariance(fit, linear, covariance, landscape),
         "covariance": covariance,
         "lost_fraction": fit.lost_fraction,
         "significance": fit.contrast_dn / max(float(sigmas[-GREY]), 1e-6),
@@ -217,28 +214,6 @@ def _precision(fit: PictureFit, noise: NoiseModel, landscape: Landscape) -> dict
         "tone": mark_tone_information(fit, linear, landscape, by_width),
         "sharpening": sharpening_score(fit, linear, by_width),
     }
-
-
-def _place_covariance(fit: PictureFit, linear: LinearFit, covariance: Array, landscape: Landscape) -> Covariance:
-    """Covariance of the place by its causes. covariance (unknowns, unknowns): by noise, rounding included."""
-    model, by_grey, by_noise = fit.model, linear.by_grey, covariance[:2, :2]
-    rounded = fit.rounding_variance_dn2 * np.trace(products(by_grey[:2], by_grey[:2]))
-    share = min(float(rounded / np.trace(by_noise)), 1.0)
-    place = Covariance.from_noise((1 - share) * by_noise).plus(Cause.ROUNDING, share * by_noise)
-    priors_dn2 = model.prior_weights * linear.noise.variance_dn2
-    more = second_order(model.design, model.slopes, fit.used, covariance, priors_dn2)
-    place = place.plus(Cause.SECOND_ORDER, more * by_noise)
-    if isinstance(model.mark, MarkTemplate) and model.mark.steadiness is not None:
-        change = fit.contrast_dn / float(np.ptp(model.mark.image))
-        place = place.plus(Cause.CHANGED_TONES, covariance_of_changed_tone(model.half_tones, by_grey, change))
-    place = place.plus(Cause.LANDSCAPE, landscape.covariance(by_grey[:2]))
-    place = place.plus(Cause.UNLIKE_DRAWING, linear.unlike_drawing_px2(by_noise))
-    place = place.plus(Cause.DAMAGE, linear.damage_px2(fit.area & ~fit.used))
-    halves = linear.halves_px2(fit.area & model.tells, fit.state.pixel_from_mark[:, 2])
-    place = place.plus(Cause.UNLIKE_DRAWING, halves)
-    if not model.is_chip and model.background_px is None:
-        place = place.plus(Cause.TEXTURE, linear.texture_px2(fit.area & model.tells))
-    return place
 
 
 def _by_line_width(fit: PictureFit) -> Array:

@@ -25,6 +25,13 @@ _BESIDE_PX = 6.0  # px around the drawing: the mark's own background
 _FAR = 5.0  # standard deviations of the mark's side, mark included: a larger step is not the mark's background
 _EDGE_PX = 4.0  # px reached by an edge's blur: at 1.4 px blur, 1/500 of the step is left at this distance
 _DRAWN, _SHOWN = 0.05, 0.5  # fractions of the mark's contrast: the whole mark, and its certain pixels
+_BITS = (8, 10, 12, 14, 16)  # bit depths of scanners' converters; values are stored unchanged or shifted up
+_LOG_DENSITY = -0.5 * np.log(2 * np.pi)  # log density of the standard normal distribution at 0
+_TAIL = 2.0  # noise standard deviations below the maximum: the tail of the histogram
+_LEAST_STEPS = 1.5  # grey-value steps per noise standard deviation; with less noise a uniform area piles up as well
+_FEWEST = 20  # pixels; fewer clipped ones do not affect a fit
+_GROSS = 3.5  # standard deviations beyond which a residual is damage
+_SCALE_ROUNDS = 8  # iterations; each leaves at most two fifths of the error
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,15 +174,6 @@ def pixels_beyond_edge(window: NDArray[np.floating], mark: Mark, pixel_from_mark
 # is -2 log of that probability (a deviance residual): the ordinary residual where the model lies well within the range,
 # zero where it lies well beyond. No observation is excluded by a threshold, which would bias the rest.
 # Its information is the curvature of that likelihood.
-
-
-_BITS = (8, 10, 12, 14, 16)  # bit depths of scanners' converters; values are stored unchanged or shifted up
-_LOG_DENSITY = -0.5 * np.log(2 * np.pi)  # log density of the standard normal distribution at 0
-_TAIL = 2.0  # noise standard deviations below the maximum: the tail of the histogram
-_LEAST_STEPS = 1.5  # grey-value steps per noise standard deviation; with less noise a uniform area piles up as well
-_FEWEST = 20  # pixels; fewer clipped ones do not affect a fit
-_GROSS = 3.5  # standard deviations beyond which a residual is damage
-_SCALE_ROUNDS = 8  # iterations; each leaves at most two fifths of the error
 
 
 def clipped_sides(samples: Samples, full_scale_dn: float, weights: Sequence[float] | None = None) -> Sides:

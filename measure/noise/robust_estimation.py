@@ -14,10 +14,9 @@ Real = TypeVar("Real", np.float32, np.float64)
 MEDIAN_EFFICIENCY = 0.37  # of a variance from the median, relative to one from the mean of squares
 STUDENT_FREEDOM = 4.0  # degrees of freedom of Student's t: robust against a fifth of outliers
 _TUKEY = 4.685  # in standard deviations: 95 % efficient in normal noise
-_WORST_CONDITION = 1e10  # of regular normal equations
-
-
 SIGMA_OF_DEVIATION = 1.4826  # ratio of standard deviation and median absolute deviation of normal values
+_WORST_CONDITION = 1e10  # of regular normal equations
+_SMOOTHING_PX = 0.8  # of the residuals: little more than a pixel, for the finest specks
 
 
 def tukey_weights(residuals: NDArray[Real], scale: float) -> NDArray[Real]:
@@ -120,9 +119,6 @@ def _median(values: Array) -> float:
     middle = values.size // 2  # np.median is many times slower for a small window
     parted = np.partition(values, middle, axis=None)
     return float(parted[middle] if values.size % 2 else (parted[:middle].max() + parted[middle]) / 2)
-
-
-_SMOOTHING_PX = 0.8  # of the residuals: little more than a pixel, for the finest specks
 
 
 def damage(residuals: Array, area: Mask, sigmas: float, floor_dn: float, is_lossy: bool = False) -> Mask:

@@ -37,6 +37,8 @@ from measure.tie_points.tracks import (
 Pieces = dict[int, Piece | Reason]  # by frame; a reason where there is none
 
 _RADII_PX = (RADIUS_PX, 21, 30)  # of patches: the next one, of twice the area, where the texture is too weak
+Progress = Callable[[str, int, int], None]
+
 _FEATURES = 25  # per scan and point wanted; about one in five is shared by all frames
 _LEAST_FEATURES = 3000  # per scan: enough to verify the pairs of a small project
 _NONE_HERE = "No natural points are sought here"
@@ -53,8 +55,6 @@ _UNLIKE_NEIGHBOURS = Reason(
 _UNEVEN = Reason("parts of the picture about the point move differently: its surface is not plane", Code.OTHER_SCANS)
 _OTHER_PICTURE = Reason("the picture about the point differs from that in the other scans", Code.OTHER_SCANS)
 _PRECISE_PX = 0.125  # largest rms position error of a `measured` point
-Progress = Callable[[str, int, int], None]
-
 _FEWEST_IMAGES = 3  # two frames cannot contradict each other along the line of sight
 
 

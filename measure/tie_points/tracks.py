@@ -25,15 +25,15 @@ from measure.scans.parallel import map_or_replace
 from measure.tie_points.features import Features, TieFrame, interleave_groups, shared_features
 from measure.tie_points.multi_image import RADIUS_PX
 
+Shared = Mapping[tuple[int, int], Indices]
+Track = dict[int, int]  # feature by frame
+
 _PLACE_PX, _LOCAL = 5.0, 0.1  # deviation of places from a local affine map, and of that from the pair's global one
 _REWEIGHTINGS = 6  # of the least absolute deviations
 _STRETCH = 2.0  # largest ratio of local scales between photographs that can be matched
 _NEIGHBOURS = 12  # used for a local map: four times its parameters, since some may be false
 _AGREE_PX = 2.0  # epipolar tolerance in the reduced scan, for localisation and lens distortion
 _CELLS = 8  # per side of a frame, over which points are spread
-
-Shared = Mapping[tuple[int, int], Indices]
-Track = dict[int, int]  # feature by frame
 FEWEST_PAIRS = 16  # twice the minimal number for a fundamental matrix
 _CONFIDENCE, _TRIALS = 0.9999, 10000  # of MAGSAC: probability of success, and largest number of trials
 _MEDIAN_NEIGHBOURS = 8  # their median distance estimates lens distortion and film deformation
@@ -229,11 +229,8 @@ def tracks_of_pairs(shared: Shared) -> list[Track]:
 def epipolar_inliers(first: Array, second: Array, tolerance: float) -> Mask:
     """Mask of the pairs of points (n, 2) that satisfy one epipolar geometry within a tolerance, in the points' unit. No
     pair passes where there are too few inliers."""
-    nothing = np.zeros(len(first), dtype=bool)
-    if len(first) < FEWEST_PAIRS:
-        return nothing
-    _, inside = cv2.findFundamentalMat(first, second, cv2.USAC_MAGSAC, tolerance, _CONFIDENCE, _TRIALS)
-    return nothing if inside is None or np.count_nonzero(inside) < FEWEST_PAIRS else inside.ravel() > 0
+    _, inside = _epipolar_geometry(first, second, tolerance)
+    return inside if np.count_nonzero(inside) >= FEWEST_PAIRS else np.zeros(len(first), dtype=bool)
 
 
 def epipolar_outliers(first: Array, second: Array, tolerance: float) -> Mask:
@@ -242,16 +239,24 @@ def epipolar_outliers(first: Array, second: Array, tolerance: float) -> Mask:
     Lens distortion and film deformation shift neighbouring pairs alike: the test uses the distance of a pair minus the
     median of its neighbours.
     """
-    if len(first) < FEWEST_PAIRS:
-        return np.zeros(len(first), dtype=bool)
-    matrix, _ = cv2.findFundamentalMat(first, second, cv2.USAC_MAGSAC, tolerance, _CONFIDENCE, _TRIALS)
+    matrix, _ = _epipolar_geometry(first, second, tolerance)
     if matrix is None:
         return np.zeros(len(first), dtype=bool)
-    distance = _sampson(np.asarray(matrix, np.float64)[:3], first, second)
+    distance = _sampson(matrix, first, second)
     near = np.asarray(cKDTree(first).query(first, _MEDIAN_NEIGHBOURS + 1)[1])[:, 1:]
     alone = distance - np.median(distance[near], axis=1)
     limit = -float(ndtri(POINT_OFF_ITS_RAY / 2)) * robust_scale(alone)
     return np.asarray(np.abs(alone) > limit)
+
+
+def _epipolar_geometry(first: Array, second: Array, tolerance: float) -> tuple[Array | None, Mask]:
+    """Fundamental matrix (3, 3) of pairs (n, 2) by MAGSAC, None if there is none, and the mask of its inliers."""
+    matrix = inside = None
+    if len(first) >= FEWEST_PAIRS:
+        matrix, inside = cv2.findFundamentalMat(first, second, cv2.USAC_MAGSAC, tolerance, _CONFIDENCE, _TRIALS)
+    if matrix is None:
+        return None, np.zeros(len(first), dtype=bool)
+    return np.asarray(matrix, np.float64)[:3], np.asarray(inside).ravel() > 0
 
 
 def _sampson(matrix: Array, first: Array, second: Array) -> Array:

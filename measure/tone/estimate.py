@@ -12,6 +12,7 @@ _POWERS = 0.4, 3.0  # range of gamma; an estimate outside has a different cause
 _LINEAR = 0.3  # in standard deviations, shift of a mark for which its linearised fit serves
 _TELLING = 0.25  # trace of a mark's information, whose unit is that of the prior on one departure
 _LONGEST = 1.0  # in standard deviations, largest change of a departure per iteration
+_SINGULAR = 1e-12  # relative eigenvalue of the normalised normal matrix below which it is numerical rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +124,6 @@ class FrameTone:
 # the departures d of the curve, the residuals of a fit are r + H d - D x. Let L be the part of H orthogonal to D. The
 # score L'r grows with d by N = L'H and has the covariance S of the noise. N' S^-1 N is the information, also for
 # correlated noise.
-
-_SINGULAR = 1e-12  # relative eigenvalue of the normalised normal matrix below which it is numerical rounding
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,12 +9,13 @@ import pytest
 from drawn import ALIKE, Array, brute_picture, lay_out, make_scan, measured_mark, paint
 from numpy.typing import NDArray
 
+from adjust.functional_model.transformation import FILM_NAMES, HIGHEST_ORDER, film_parameter_names
 from measure import FiducialOptions, Scan, Status
 from measure.detection.responses import ByteCache, Responses
 from measure.fiducials import consistency, stages
 from measure.fiducials.across_frames import check_frames
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, same_picture
-from measure.fiducials.interior_orientation import AFFINITY_SIGMA, fit_frame
+from measure.fiducials.interior_orientation import AFFINITY_SIGMA, FrameFit, film_terms, fit_frame
 from measure.fiducials.measure_frame import Frame, fit_lines_and_sharpening, measure_frame
 from measure.fiducials.measurement import _lacks_its_own, present_frame
 from measure.fiducials.scan_checks import pitch_problem
@@ -38,11 +39,17 @@ def view_marks(camera: Array, turn: Array, scale: float = 1.01, angle: float = 0
     return np.asarray(camera @ (scale * np.array([[c, -s], [s, c]]) @ turn).T + (12.0, -34.0))
 
 
+def predicted_mm(fit: FrameFit) -> Array:
+    """Places of `EIGHT` in the scan by a fit."""
+    straight = EIGHT @ fit.up_from_camera[:, :2].T + fit.up_from_camera[:, 2]
+    return np.asarray(straight if fit.film is None else fit.film.places_mm(EIGHT))
+
+
 @pytest.mark.parametrize("pose", POSES)
 def test_a_similarity_is_found_without_residuals_in_every_pose(pose: str) -> None:
     turn = UP_FROM_CAMERA[pose]
     fit = fit_frame(EIGHT, view_marks(EIGHT, turn), np.full(8, 0.005), turn)
-    np.testing.assert_allclose(fit.residuals_mm, 0.0, atol=1e-9)
+    np.testing.assert_allclose(predicted_mm(fit), view_marks(EIGHT, turn), atol=1e-9)
     assert fit.chi_square == pytest.approx(0.0, abs=1e-9)
     assert fit.redundancy == 12
     assert np.sign(np.linalg.det(fit.up_from_camera[:, :2])) == (-1 if pose.endswith("m") else 1)
@@ -62,7 +69,7 @@ def test_halving_a_marks_sigma_changes_its_share_of_the_residual() -> None:
     for sigma in (0.02, 0.01, 0.005):
         sigmas = np.full(8, 0.01)
         sigmas[0] = sigma
-        sizes.append(np.hypot(*fit_frame(EIGHT, disturbed, sigmas, turn).residuals_mm[0]))
+        sizes.append(np.hypot(*(disturbed - predicted_mm(fit_frame(EIGHT, disturbed, sigmas, turn)))[0]))
     assert sizes[0] > 1.1 * sizes[1] > 1.2 * sizes[2]
 
 
@@ -125,6 +132,23 @@ def test_of_four_marks_on_one_frame_none_is_called_wrong_where_film_may_be_bent(
     assert outlying(SQUARE, four) == []
 
 
+@pytest.mark.parametrize("order", range(1, HIGHEST_ORDER + 1))
+@pytest.mark.parametrize("name", FILM_NAMES)
+def test_every_film_model_of_the_adjustment_has_its_terms(name: str, order: int) -> None:
+    """As many as the adjustment has parameters beyond those of an affine transformation, or of a similarity."""
+    model = name.replace("(n)", f"({order})")
+    beyond = len(film_parameter_names(model)) - (4 if "conformal" in name else 6)
+    assert film_terms(model, EIGHT).shape == (16, max(beyond, 0))
+    assert np.linalg.matrix_rank(film_terms(model, EIGHT / 100.0)[:, :4]) == min(max(beyond, 0), 4)
+    assert FiducialOptions(film_model=model).film_model == model
+
+
+@pytest.mark.parametrize("model", ["helmert", "polynomial", "conformal(x)", "projective2"])
+def test_a_film_model_that_is_not_known_is_refused(model: str) -> None:
+    with pytest.raises(ValueError, match="one of none, congruent, similarity, affine, projective"):
+        FiducialOptions(film_model=model)
+
+
 @pytest.mark.parametrize("pose", POSES)
 def test_a_perspective_is_fitted_without_residuals(pose: str) -> None:
     """By the closed form of a pinhole 600 mm away, tilted by 5 degrees, in every scan orientation."""
@@ -133,7 +157,7 @@ def test_a_perspective_is_fitted_without_residuals(pose: str) -> None:
     pictured = np.column_stack([x * np.cos(tilt), y]) / (1 + x * np.sin(tilt) / 600.0)[:, None]
     up = view_marks(pictured, turn)
     fit = fit_frame(EIGHT, up, np.full(8, 0.005), turn, "projective")
-    assert np.abs(fit.residuals_mm).max() < 0.002  # what is believed of tilts beforehand takes the rest
+    assert np.abs(up - predicted_mm(fit)).max() < 0.002  # what is believed of tilts beforehand takes the rest
     assert fit.film is not None
     step = 1e-3
     around = np.array([(50.0 + step, 30.0), (50.0 - step, 30.0)])
