@@ -22,7 +22,7 @@ Kind = Literal["fiducial", "target", "tie", "join"]
 ON_FILM: tuple[Kind, ...] = ("fiducial", "join")  # kinds that are points of the film, not of the object
 # Stored results are reused only if this is unchanged. Increase it whenever measurements would change:
 # tests/measure/test_revision.py fails if that was forgotten.
-MEASURE_REVISION = 42
+MEASURE_REVISION = 43
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -283,7 +283,7 @@ class MarkFit:
     pixel_from_mark : (2, 3) mm of the mark to pixels of the scan.
     contrast_dn : light of the mark minus that of the background, negative for a dark mark.
     stored_contrast_dn : the same in grey values of the file.
-    noise_dn : standard deviation of one pixel's noise, for a chip after smoothing.
+    noise_dn : standard deviation of one pixel's noise in light, for a chip after smoothing.
     blur_px : standard deviation of the blur.
     damaged_fraction : fraction of the pixels within plain_px of the mark that were masked.
     lost_fraction : fraction of the place's information lost to damage, in the direction with the largest loss.

@@ -1,6 +1,6 @@
 """Observations: marks in images, distances between points, earlier calibrations."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -55,6 +55,11 @@ class Observations:
         """Unique names of all points and fiducials, and the number (n,) of each observation's point among them."""
         number = {name: i for i, name in enumerate(dict.fromkeys(self.point))}
         return tuple(number), np.array([number[name] for name in self.point], dtype=np.intp)
+
+    def mirror(self, signs: Array, shifts_mm: Array | float = 0.0) -> "Observations":
+        """Multiply x and y of each row by signs (n, 2), 1 or -1, with the covariances, then add shifts (n, 2)."""
+        covariance_mm2 = self.covariance_mm2 * signs[:, :, None] * signs[:, None, :]
+        return replace(self, xy_mm=self.xy_mm * signs + shifts_mm, covariance_mm2=covariance_mm2)
 
     def only(self, rows: Indices) -> "Observations":
         """Select rows."""

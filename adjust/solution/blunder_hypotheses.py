@@ -168,7 +168,7 @@ def reversed_y(network: Network, keeps_given: bool = False) -> Network:
     keeps_given: whether given principal points stay.
     """
     digital = np.array([image.transformation == "none" for image in network.images])[network.image_numbers]
-    xy_mm = network.observations.xy_mm * np.where(digital[:, None], [1.0, -1.0], 1.0)
+    observations = network.observations.mirror(np.where(digital[:, None], [1.0, -1.0], 1.0))
     cameras = []
     for camera in network.cameras:
         marks = {
@@ -177,7 +177,7 @@ def reversed_y(network: Network, keeps_given: bool = False) -> Network:
         center_mm, y0_mm = (camera.center_mm[0], -camera.center_mm[1]), _scaled(camera.y0_mm, -1.0)
         turned = replace(camera, y0_mm=y0_mm, fiducials=marks, center_mm=center_mm)
         cameras.append(camera if keeps_given and camera.y0_mm else turned)
-    return replace(network, cameras=tuple(cameras), observations=replace(network.observations, xy_mm=xy_mm))
+    return replace(network, cameras=tuple(cameras), observations=observations)
 
 
 def _mirrored_images(network: Network) -> Iterator[NetworkHypothesis]:
@@ -216,10 +216,9 @@ def mirrored_images(network: Network, names: Sequence[str]) -> Network:
         middle[camera.name] = own
     turned = np.array([image.name in names and image.transformation == "none" for image in network.images])
     centers = np.array([middle[image.camera] for image in network.images])[network.image_numbers]
-    xy_mm = network.observations.xy_mm.copy()
-    is_turned = turned[network.image_numbers]
-    xy_mm[is_turned, 0] = 2.0 * centers[is_turned] - xy_mm[is_turned, 0]
-    return replace(network, observations=replace(network.observations, xy_mm=xy_mm))
+    is_turned = turned[network.image_numbers, None]
+    shifts_mm = np.where(is_turned, np.outer(centers, [2.0, 0.0]), 0.0)
+    return replace(network, observations=network.observations.mirror(np.where(is_turned, [-1.0, 1.0], 1.0), shifts_mm))
 
 
 def _distances(network: Network) -> Iterator[NetworkHypothesis]:

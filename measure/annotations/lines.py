@@ -10,6 +10,7 @@ lines are legible from one side of the film.
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import date
 from difflib import SequenceMatcher
 
 from measure.marks.shapes import Side
@@ -153,16 +154,22 @@ def _frames(match: re.Match[str]) -> str:
 def _date(match: re.Match[str]) -> str:
     """ISO date; "" where day and month cannot be distinguished."""
     first, second, year = int(match[1]), int(match[2]), _year(match[3])
-    readings = {(day, month) for day, month in ((first, second), (second, first)) if day <= 31 and 1 <= month <= 12}
-    if not year or len(readings) != 1:
-        return ""
-    ((day, month),) = readings
-    return f"{year}-{month:02d}-{day:02d}" if day else ""
+    readings = {_iso_date(year, month, day) for day, month in ((first, second), (second, first))} - {""}
+    return readings.pop() if len(readings) == 1 else ""
 
 
 def _named_date(match: re.Match[str]) -> str:
+    """ISO date; year and month where no day stands before the month."""
     month, year = _MONTHS.index(match[2][:3].upper()) + 1, _year(match[3])
-    return f"{year}-{month:02d}" + (f"-{int(match[1]):02d}" if match[1] else "") if year else ""
+    return _iso_date(year, month, int(match[1])) if match[1] else _iso_date(year, month, 1)[:-3]
+
+
+def _iso_date(year: str, month: int, day: int) -> str:
+    """ISO date; "" without a year, and for a day that the calendar does not have."""
+    try:
+        return date(int(year), month, day).isoformat()
+    except ValueError:
+        return ""
 
 
 def _year(text: str) -> str:

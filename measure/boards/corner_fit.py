@@ -43,6 +43,25 @@ _FAR = np.float32(9.0)  # standard deviations beyond which nothing changes; deno
 _NODES, _MOST_NODES = ((0.3, 2), (0.55, 3), (0.8, 5)), 10  # nodes of the quadrature by correlation, single precision
 _ERF_SCALE = 0.3275911
 _ERF_FACTORS = (1.061405429, -1.453152027, 1.421413741, -0.284496736, 0.254829592)
+_SCALE_FLOOR = 0.05  # fraction of the contrast, floor of Tukey's scale: sharpening and tone curves are not damage
+_MAX_ITERATIONS = 30  # per stage
+_UNDAMAGED = 0.05  # robust weight below which a pixel counts as an outlier
+# One plain and two robust stages. The residual scale is fixed at the start of each, so that the iteration converges.
+_STAGES_TOLERANCE_PX = (0.05, 0.01, 0.001)
+_SHAPE_UNKNOWNS = 5  # point (2), directions (2), blur
+_MOST_SHIFT = 0.6  # fraction of the reach; beyond it the edges of a different corner are nearer
+_MOST_TURN_RAD = 0.35  # rad (20°), largest turn of an edge; approximate directions are better
+_START_BLUR_PX, _LEAST_BLUR_PX = 0.8, 0.3  # px, pixel included
+_DAMPING = 1e-9  # of a step, stabilises poorly determined unknowns
+_GREY_DAMPING = 1e-12  # for grey values, which are never singular
+_SPARE_PX = 2  # px margin around the area, so that a corner can move
+_LONGEST_TURN_RAD = 0.15  # rad, largest turn of an edge in one step for which the linearisation holds
+_LARGEST_HALF_WINDOW_PX = 6  # px around a junction; larger windows include the distortion of longer edges
+_HALF_WINDOW = 0.85  # fraction of the reach; the weight is 0.37 at the middle of the window's sides, 0.14 at corners
+_SMOOTHING_PX = 1.0  # px, suppresses pixel noise while edges stay separate
+_BORDER_PX = 4  # px, reflected border of each window, the reach of the smoothing
+_SUBPIX_BORDER_PX = 5  # px that OpenCV requires in addition to twice the half window
+_SUBPIX_END = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-4)  # iterations, px of the last step
 
 
 def crossing(u: Single, v: Single, correlation: Single) -> tuple[Single, Single, Single, Single]:
@@ -114,27 +133,6 @@ def _gauss_legendre(nodes: int) -> list[tuple[float, float]]:
     return list(zip(*(each.tolist() for each in np.polynomial.legendre.leggauss(nodes)), strict=True))
 
 
-_SCALE_FLOOR = 0.05  # fraction of the contrast, floor of Tukey's scale: sharpening and tone curves are not damage
-_MAX_ITERATIONS = 30  # per stage
-_UNDAMAGED = 0.05  # robust weight below which a pixel counts as an outlier
-# One plain and two robust stages. The residual scale is fixed at the start of each, so that the iteration converges.
-_STAGES_TOLERANCE_PX = (0.05, 0.01, 0.001)
-_SHAPE_UNKNOWNS = 5  # point (2), directions (2), blur
-_MOST_SHIFT = 0.6  # fraction of the reach; beyond it the edges of a different corner are nearer
-_MOST_TURN_RAD = 0.35  # rad (20°), largest turn of an edge; approximate directions are better
-_START_BLUR_PX, _LEAST_BLUR_PX = 0.8, 0.3  # px, pixel included
-_DAMPING = 1e-9  # of a step, stabilises poorly determined unknowns
-_GREY_DAMPING = 1e-12  # for grey values, which are never singular
-_SPARE_PX = 2  # px margin around the area, so that a corner can move
-_LONGEST_TURN_RAD = 0.15  # rad, largest turn of an edge in one step for which the linearisation holds
-_LARGEST_HALF_WINDOW_PX = 6  # px around a junction; larger windows include the distortion of longer edges
-_HALF_WINDOW = 0.85  # fraction of the reach; the weight is 0.37 at the middle of the window's sides, 0.14 at corners
-_SMOOTHING_PX = 1.0  # px, suppresses pixel noise while edges stay separate
-_BORDER_PX = 4  # px, reflected border of each window, the reach of the smoothing
-_SUBPIX_BORDER_PX = 5  # px that OpenCV requires in addition to twice the half window
-_SUBPIX_END = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-4)  # iterations, px of the last step
-
-
 @dataclass(frozen=True, eq=False)
 class Corner:
     """Fitted corner. If reason is not empty the fit failed, and the values are those of its last iteration.
@@ -191,24 +189,31 @@ def fit_corners(
     starts: Sequence[CornerStart],
     surface: Surface,
     rounding_step_dn: float = 0.0,
+    first_block_px: tuple[int, int] = (0, 0),
 ) -> list[Corner]:
     """Fit all corners of a board at once. read: returns the square window with the given first column, first row and
-    side, px; surface: `crossing` or `quarter`; rounding_step_dn: of the scan."""
+    side, px; surface: `crossing` or `quarter`; rounding_step_dn, first_block_px: of the scan."""
     if not starts:
         return []
     half = max(start.half_px for start in starts)
     firsts = [np.round(start.center_px).astype(int) - half for start in starts]
     windows = [read(int(col), int(row), 2 * half + 1) for col, row in firsts]
-    return _CornerFits(windows, starts, surface, rounding_step_dn).run()
+    return _CornerFits(windows, starts, surface, rounding_step_dn, first_block_px).run()
 
 
 class _CornerFits:
     """Adjustments of n corners in progress. Arrays over pixels are (n, p): p candidate pixels of each corner."""
 
     def __init__(
-        self, windows: Sequence[ScanWindow], starts: Sequence[CornerStart], surface: Surface, rounding_step_dn: float
+        self,
+        windows: Sequence[ScanWindow],
+        starts: Sequence[CornerStart],
+        surface: Surface,
+        rounding_step_dn: float,
+        first_block_px: tuple[int, int],
     ) -> None:
-        self.windows, self.surface, self.rounding_step_dn = windows, surface, rounding_step_dn
+        self.windows, self.surface = windows, surface
+        self.rounding_step_dn, self.first_block_px = rounding_step_dn, np.array(first_block_px)
         self.origin = np.array([window.origin_px for window in windows], float)
         self.start = np.array([start.center_px for start in starts], float) - self.origin
         self.reach = np.array([start.reach_px for start in starts], float)
@@ -302,7 +307,9 @@ class _CornerFits:
         losses = np.zeros_like(covariances)
         if self.rounding_step_dn:
             fitted = self._pictures(self.grey - residuals)
-            losses = covariances_of_rounding(influence, fitted, self.origin, self.rounding_step_dn)
+            losses = covariances_of_rounding(
+                influence, fitted, self.origin - self.first_block_px, self.rounding_step_dn
+            )
         covariances[fails], noise_dn = np.inf, np.where(fails, np.nan, np.sqrt(variances))
         rounding_dn = np.finfo(np.float32).eps * np.abs(self.linear[:, 1])  # for a uniform window without noise
         faint = ~fails & ~(np.abs(self.linear[:, 0]) > 2 * np.maximum(noise_dn, rounding_dn))

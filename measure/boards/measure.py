@@ -92,7 +92,7 @@ def _measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> BoardMeasurement:
     disks = {place: fit for place, fit in zip(starts, fits, strict=True) if fit.reason or _is_whole(scan, fit)}
     marks = [_dot_mark(name, disks.get(place), place in detected) for place, name in names.items()]
     measured = BoardMeasurement(tuple(marks), notes=grid.notes, is_mirrored=is_mirrored)
-    return _unless_alone(measured, f"grids of {grid_size(spec, 'dots')}", grid.others_px)
+    return _unless_alone(scan, measured, f"grids of {grid_size(spec, 'dots')}", grid.others_px)
 
 
 def _appearances(patches: list[TargetCandidate]) -> Array:
@@ -173,15 +173,16 @@ def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
         tuple(marks), board.reason, notes, tuple(board.refused.values()), is_mirrored=board.is_mirrored
     )
     what = "squares" if isinstance(spec, SquareGridSpec) else "inner corners"
-    return _unless_alone(measured, f"boards of {spec.columns} x {spec.rows} {what}", board.others_px)
+    return _unless_alone(scan, measured, f"boards of {spec.columns} x {spec.rows} {what}", board.others_px)
 
 
-def _unless_alone(measured: BoardMeasurement, kind: str, others_px: Sequence[Array]) -> BoardMeasurement:
+def _unless_alone(scan: Scan, measured: BoardMeasurement, kind: str, others_px: Sequence[Array]) -> BoardMeasurement:
     """Reject the points of a board if the scan shows others that look the same: their identity is ambiguous."""
     if not others_px:
         return measured
     middle = np.mean([mark.center_px for mark in measured.marks if mark.center_px is not None], axis=0)
-    places = " and ".join(f"({column:.0f}, {row:.0f})" for column, row in (middle, *others_px))
+    in_file = (np.add(place, scan.origin_px) for place in (middle, *others_px))
+    places = " and ".join(f"({column:.0f}, {row:.0f})" for column, row in in_file)
     message = f"the scan shows {1 + len(others_px)} {kind}, about the pixels {places}, and nothing tells which is meant"
     why = Reason(f"{message}: cover the others", Code.AMBIGUOUS)
     marks = tuple(
@@ -208,7 +209,8 @@ def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) ->
         return ScanWindow(scan.window(*place_px), (col, row), scan.inside(*place_px, is_read=True), sides)
 
     surface: Surface = quarter if stands_alone else crossing
-    fitted = dict(zip(found, fit_corners(read, starts, surface, scan.rounding_step_dn), strict=True))
+    corners = fit_corners(read, starts, surface, scan.rounding_step_dn, scan.first_block_px)
+    fitted = dict(zip(found, corners, strict=True))
     if not stands_alone:
         return fitted
     return without_edge_shift(fitted, found, points, (scan.width_px, scan.height_px))

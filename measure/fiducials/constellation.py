@@ -308,12 +308,12 @@ class _Constellation:
         """All similarities within bounds through two marks and two of their candidates."""
         bounds = self.search.bounds
         candidates = {key: self._complex(self.responses.candidates(key)) for key in dict.fromkeys(self.keys)}
-        scales, offsets = [np.zeros(0, complex)], [np.zeros(0, complex)]
+        scales, offsets = [np.zeros(0, complex)], [np.zeros(0, complex)]  # of a layout with one mark there are none
         upright = np.cos(bounds.rotation_rad)
         # Of pairs of distant marks; an even selection if there are too many.
         ends = np.stack(np.triu_indices(len(self.camera), 1))
         length = np.abs(self.camera[ends[0]] - self.camera[ends[1]])
-        far = np.flatnonzero(length >= _FAR * length.max())
+        far = np.flatnonzero(length >= _FAR * length.max(initial=0.0))
         chosen = far[(np.arange(min(len(far), _PAIRS)) * max(1.0, len(far) / _PAIRS)).astype(int)]
         for first, second in ends[:, chosen].T.tolist():
             of_first, of_second = candidates[self.keys[first]], candidates[self.keys[second]]

@@ -330,7 +330,13 @@ def check_own_figures(frames: Sequence[FrameMeasurement]) -> list[FrameMeasureme
             finding, reason = findings[place][point], _unlike_frames(kind, one) if p_value < FALSE_DOUBT else NO_REASON
             finding[speaks_for] = finding.get(speaks_for) or reason
     return [
-        replace(frame, marks=tuple(_assess(mark, found.get(mark.point, {}), arms[mark.point]) for mark in frame.marks))
+        replace(
+            frame,
+            marks=tuple(
+                _assess(mark, found.get(mark.point, {}), arms[mark.point]) if mark.kind == "fiducial" else mark
+                for mark in frame.marks
+            ),
+        )
         for frame, found in zip(frames, findings, strict=True)
     ]
 
@@ -361,11 +367,11 @@ def compare_frames(values: Array, sigmas: Array, kind: str) -> tuple[float, Arra
 
 
 def _figures(frame: FrameMeasurement) -> dict[tuple[str, str], tuple[float, float]]:
-    """Figures of a frame's marks, as in an unmirrored scan and with arms relative to the frame's, and their sigmas."""
+    """Figures of fiducials, as in an unmirrored scan and with arms relative to the frame's, and their sigmas."""
     mirrored = -1.0 if frame.pose and frame.pose.name.endswith("m") else 1.0
     figures: dict[tuple[str, str], tuple[float, float]] = {}
     for mark in frame.marks:
-        if mark.status.is_observation:
+        if mark.kind == "fiducial" and mark.status.is_observation:
             own = {name: value for name, value in mark.quality.items() if name.endswith("_ratio")}
             if "arm1_ratio" in own:
                 del own["size_ratio"]

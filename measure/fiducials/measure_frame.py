@@ -404,7 +404,7 @@ def _detect(
     def detection(index: int) -> Detection:
         """Detection of one mark."""
         expected = frame.prediction(index, search_px)
-        found = detect_mark(frame.scan, expected.shift_to(places_px[index]) if places_px else expected, match)
+        found = detect_mark(frame.scan, expected if places_px is None else expected.shift_to(places_px[index]), match)
         sure = found.false_alarms <= FAINT_MARK_BY_NOISE
         likeness = (0.0 if closer else least_likeness) if sure else LEAST_LIKENESS
         is_faint = sure and (closer or len(frame.detections) <= MANY)
@@ -431,8 +431,8 @@ def orient_frame(frame: Frame) -> Frame:
     index = np.flatnonzero(found)
     fits = [frame.detections[i].fit for i in index]
     up = frame.up_mm(np.array([fit.center_px for fit in fits if fit]))
-    scaled = np.diag(frame.pitch_mm)
-    covariances = np.array([scaled @ fit.covariance_px2 @ scaled for fit in fits if fit])
+    up_from_px = np.diag(frame.pitch_mm * (1.0, -1.0))
+    covariances = np.array([up_from_px @ fit.covariance_px2 @ up_from_px for fit in fits if fit])
     given = np.array([min(*frame.layout.marks[i].sigma_mm, MOST_GIVEN_SIGMA_MM) for i in index])
     covariances += given[:, None, None] ** 2 * np.eye(2)
     film = Scatter(frame.options.film_sigma_mm, SCATTER_DEGREES)

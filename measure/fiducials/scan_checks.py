@@ -112,10 +112,11 @@ def _outline(frame: FrameMeasurement, layout: FiducialLayout) -> Array:
 
 
 def _words(scan: Scan, outline: Array) -> str:
-    """Window around a frame, in the notation of images.csv."""
+    """Window around a frame in the picture of the file, in the notation of images.csv."""
     low = np.maximum(np.floor(outline[:2]), 0).astype(int)
     high = np.minimum(np.ceil(outline[2:]), (scan.width_px, scan.height_px)).astype(int)
-    return f'"{low[0]} {low[1]} {high[0] - low[0]} {high[1] - low[1]}"'
+    first = low + scan.origin_px
+    return f'"{first[0]} {first[1]} {high[0] - low[0]} {high[1] - low[1]}"'
 
 
 def with_damage(scan: Scan, frame: FrameMeasurement) -> FrameMeasurement:

@@ -466,7 +466,7 @@ class MarkSite:
         """Largest excess misfit of a chip over the best one that their difference explains, noise included."""
         if view is best or not view.is_chip:
             return 0.0 if view is best else np.inf
-        squares = view.unlike(best, abs(self.like.contrast_dn) / scale_dn)
+        squares = view.unlike(best, abs(self.like.stored_contrast_dn) / scale_dn)
         return squares + 2 * _CHANCE_SIGMAS * float(np.sqrt(squares))
 
     def _placed(self, window: Array, view: MarkImage, spare: int) -> MarkImage:

@@ -19,7 +19,7 @@ from scipy.special import erf
 from measure.array_types import Array, Mask
 from measure.flags import NO_REASON, Code, Reason
 from measure.marks.shapes import FrameCorner
-from measure.matching.window import FAINT
+from measure.matching.window import FAINT, Coding
 from measure.noise.robust_estimation import gauss_newton_step, tukey_fit
 from measure.results import Covariance, MarkFit
 from measure.scans.scan import Scan
@@ -128,12 +128,13 @@ def _straightest(grey: Array, along: Array, half: float) -> tuple[float, float]:
 class _Steps:
     """Steps level + contrast * Phi((s - place) / blur) fitted to n profiles.
 
-    place (px), contrast, blur, noise, likeness: (n,) each; drawn, residuals: (n, samples) model and residuals; design:
-    (n, 4, samples) derivatives.
+    place (px), contrast (light), stored_contrast (grey values of the file), blur (px), noise (light), likeness: (n,)
+    each; drawn, residuals: (n, samples) model and residuals; design: (n, 4, samples) derivatives.
     """
 
     place: Array
     contrast: Array
+    stored_contrast: Array
     blur: Array
     noise: Array
     likeness: Array
@@ -142,8 +143,8 @@ class _Steps:
     design: Array
 
     @classmethod
-    def fitted(cls, grey: Array) -> "_Steps":
-        """Fit a step to every profile (n, samples) by Gauss-Newton."""
+    def fitted(cls, grey: Array, coding: Coding) -> "_Steps":
+        """Fit a step to every profile (n, samples) of light by Gauss-Newton. coding: of the scan."""
         s = _samples(grey)
         place, blur = np.zeros((len(grey), 1)), np.full((len(grey), 1), _START_BLUR_PX)
         for rounds_left in range(_ITERATIONS, -1, -1):
@@ -161,7 +162,9 @@ class _Steps:
                 blur = np.clip(blur + np.clip(change[:, 1:2], -0.5, 0.5), *_BLUR_RANGE_PX)
         noise = np.sqrt((residuals**2).mean(axis=1))
         likeness = np.sqrt(np.clip(1 - (noise / np.maximum(grey.std(axis=1), 1e-12)) ** 2, 0.0, 1.0))
-        return cls(place[:, 0], contrast[:, 0], blur[:, 0], noise, likeness, grey - residuals, residuals, design)
+        ground, contrast, drawn = (grey - contrast * step).mean(axis=1), contrast[:, 0], grey - residuals
+        stored = np.array(list(map(coding.stored_contrast_dn, ground.tolist(), contrast.tolist())))
+        return cls(place[:, 0], contrast, stored, blur[:, 0], noise, likeness, drawn, residuals, design)
 
     def select(self, kept: Mask) -> "_Steps":
         return _Steps(*(each[kept] for each in vars(self).values()))
@@ -199,9 +202,9 @@ def _find_edge(course: _Course, extent: tuple[float, float], search_px: float, p
         return None
     offset, slope = _straightest(near * polarity, middle, half)
     profiles, _ = course.profiles(middle, offset + slope * middle, share, _ABOUT_PX)
-    steps = _Steps.fitted(profiles)
+    steps = _Steps.fitted(profiles, Coding(None, course.scan.tone, course.scan.full_scale_dn))
     good = np.abs(steps.place) < _samples(profiles)[-1] - _RIM_PX
-    good &= steps.contrast * polarity > FAINT * course.scan.full_scale_dn
+    good &= steps.stored_contrast * polarity > FAINT * course.scan.full_scale_dn
     good &= np.abs(steps.contrast) > _LEAST_SNR * steps.noise
     if good.sum() < _LEAST_SHARE * _PROFILES:
         return None
@@ -258,9 +261,9 @@ def _intersect_edges(edges: Sequence[_Edge], unit: Array, pixel_from_mark: Array
     by_lines = [unit @ (scale * np.array(by)) for by in ([[d, d * x], [1.0, x]], [[1.0, y], [b, b * y]])]
     covariance = sum(by @ edge.covariance @ by.T for by, edge in zip(by_lines, edges, strict=True))
     center, counts = pixel_from_mark[:, 2] + unit @ (x, y), [len(edge.steps.place) for edge in edges]
-    contrasts, noises, blurs, likenesses = (
+    contrasts, stored_contrasts, noises, blurs, likenesses = (
         [float(np.median(getattr(edge.steps, name))) for edge in edges]
-        for name in ("contrast", "noise", "blur", "likeness")
+        for name in ("contrast", "stored_contrast", "noise", "blur", "likeness")
     )
     contrast, noise = min(contrasts, key=abs), max(noises)
     tones = [edge.tone for edge in edges if edge.tone is not None]
@@ -271,7 +274,7 @@ def _intersect_edges(edges: Sequence[_Edge], unit: Array, pixel_from_mark: Array
         place_covariance=Covariance.from_noise(np.asarray(covariance)),
         pixel_from_mark=np.column_stack([pixel_from_mark[:, :2], center]),
         contrast_dn=contrast,
-        stored_contrast_dn=contrast,
+        stored_contrast_dn=min(stored_contrasts, key=abs),
         noise_dn=noise,
         blur_px=max(blurs),
         damaged_fraction=1.0 - min(edge.share for edge in edges),

@@ -38,6 +38,8 @@ class Segments(ABC):
     full_scale_dn : largest value.
     sample_bytes : 1 or 2.
     rounding_step_dn : quantisation step of coarse detail by lossy compression; 0 without any.
+    first_block_px : column and row, 0 to 7, at which the first whole block of a JPEG compression begins.
+    origin_px : column and row of the first pixel in the picture of the file.
     lost : undecodable parts of the segments read so far. Their samples are set to half of the full scale, so that
         nothing there resembles a mark.
     """
@@ -50,6 +52,8 @@ class Segments(ABC):
     full_scale_dn: float
     sample_bytes: int
     rounding_step_dn: float
+    first_block_px: tuple[int, int] = (0, 0)
+    origin_px: tuple[int, int] = (0, 0)
 
     @property
     def lost(self) -> Sequence[LostPart]:
@@ -74,7 +78,7 @@ class OpenedPicture:
     """The image of a scan file.
 
     notes, problems: one sentence each; overviews: reduced copies of the image; orientation: the orientation tag, 1 if
-    viewers do not rotate the image (TIFF 6.0).
+    viewers do not rotate the image (TIFF 6.0); bits: of a sample as the file stores it, 0 if not known.
     """
 
     segments: Segments
@@ -83,6 +87,7 @@ class OpenedPicture:
     problems: tuple[str, ...] = ()
     overviews: tuple[Segments, ...] = ()
     orientation: int = 1
+    bits: int = 0
 
 
 @dataclass(eq=False)

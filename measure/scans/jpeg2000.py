@@ -1,4 +1,4 @@
-"""JPEG 2000 files and codestreams: decoded whole, and what their boxes and markers say (ITU-T T.800, A and I)."""
+"""JPEG 2000 files and codestreams (ITU-T T.800, A and I): the picture, decoded whole, and its metadata."""
 
 import struct
 from collections.abc import Iterator
@@ -12,48 +12,46 @@ from measure.scans.cache import OpenedPicture, WholePicture
 from measure.scans.metadata import (
     DECODING_ERRORS,
     NO_TAGS,
+    PictureForm,
     Pitch,
-    check_size,
     damage_error,
     grey_or_colour,
     pitch_from_density,
 )
+from measure.tone.declared import ColourTags
 
 JPEG2000_STARTS = (b"\x00\x00\x00\x0cjP  \r\n\x87\n", b"\xff\x4f\xff\x51")  # a file of boxes, and a bare codestream
-_SIZ, _COD, _SOT, _END = b"\xff\x51", 0xFF52, 0xFF90, b"\xff\xd9"
+JPEG2000_END = b"\xff\xd9"
+_SIZ, _COD, _SOT = b"\xff\x51", 0xFF52, 0xFF90
 _IRREVERSIBLE = 0  # the wavelet transformation 9-7 of a COD marker
-_LOSS_DN = 1.0  # a coded step: what a compression with loss moved is not told by its file
+_LOSS_DN = 1.0  # a coded step: the file does not state the errors of its lossy compression
 _LOSSY = "compressed as JPEG 2000 with loss: what that moved is not in the standard deviations"
-_HEADER_BOXES = (b"jp2h", b"res ")  # which hold others
+_BY_PROFILE = (b"\x02", b"\x03")  # methods of a colour box: a restricted or any ICC profile
+_HEADER_BOXES = (b"jp2h", b"res ")  # that contain other boxes
 
 
 @dataclass(frozen=True)
-class Jpeg2000Form:
-    """What a codestream's head says of its picture."""
+class Jpeg2000Form(PictureForm):
+    """Form of a picture by the head of its codestream."""
 
-    width_px: int
-    height_px: int
-    channels: int
-    bits: int
     is_signed: bool
     is_lossy: bool
 
 
 def open_jpeg2000(path: Path, max_pixels: int | None) -> OpenedPicture:
-    """The picture of a JPEG 2000 file, decoded whole. Raises MeasurementError for a truncated or damaged file, for one
-    that claims more than such a file can hold, and for samples that are not of 2 to 16 bits without sign."""
+    """Open and decode a JPEG 2000 file. Raises MeasurementError for a truncated or damaged file, for a size that
+    exceeds the limits of `check_size`, and for samples other than unsigned ones of 2 to 16 bits."""
     data = path.read_bytes()
     form = jpeg2000_form(data)
     if form is None:
         raise damage_error(path, "its header is cut short")
-    size, sample_bytes = (form.width_px, form.height_px), -(-form.bits // 8)
-    check_size(path, "a picture", size, size[0] * size[1] * form.channels * sample_bytes, len(data), max_pixels)
+    form.check(path, len(data), max_pixels)
     if form.is_signed or not 1 < form.bits <= 16:
         kind = "signed " if form.is_signed else ""
         raise MeasurementError(
             f"{path} is a JPEG 2000 picture of {kind}samples of {form.bits} bits: save it with 8 or 16 bits a sample"
         )
-    if _END not in data[-4096:]:
+    if JPEG2000_END not in data[-4096:]:
         raise damage_error(path, "its end marker is missing")
     try:
         decoded = imagecodecs.jpeg2k_decode(data)
@@ -69,7 +67,7 @@ def open_jpeg2000(path: Path, max_pixels: int | None) -> OpenedPicture:
 
 
 def jpeg2000_form(data: bytes) -> Jpeg2000Form | None:
-    """None without a head (T.800, A.5.1 and A.6.1)."""
+    """Read the head of the codestream (T.800, A.5.1 and A.6.1); None without one."""
     start = data.find(_SIZ)
     try:
         right, down, left, top = struct.unpack_from(">4I", data, start + 6)
@@ -87,8 +85,8 @@ def jpeg2000_form(data: bytes) -> Jpeg2000Form | None:
 
 
 def jpeg2000_pitch(data: bytes) -> Pitch:
-    """The capture resolution, or else the one to be shown by: pixels a metre as fractions with powers of ten (T.800,
-    I.5.3.7)."""
+    """Read the pitch from the capture resolution, else the display resolution: pixels a metre, fractions with powers of
+    ten (T.800, I.5.3.7)."""
     if data.startswith(JPEG2000_STARTS[1]):
         return NO_TAGS
     stored = {kind: body for kind, body in _boxes(data) if kind in (b"resc", b"resd") and len(body) >= 10}
@@ -102,8 +100,16 @@ def jpeg2000_pitch(data: bytes) -> Pitch:
     return pitch_from_density(cols / cols_by * 10.0**cols_power, rows / rows_by * 10.0**rows_power, "metre")
 
 
+def jpeg2000_colour_tags(path: Path) -> ColourTags:
+    """Read the ICC profile of a file (T.800, I.5.3.3). Every file has a colour box, and programs fill it with sRGB or
+    its grey without knowing: this declares no tone curve. Raises one of DECODING_ERRORS."""
+    data = path.read_bytes()
+    bodies = () if data.startswith(JPEG2000_STARTS[1]) else (body for kind, body in _boxes(data) if kind == b"colr")
+    return ColourTags(next((body[3:] for body in bodies if body[:1] in _BY_PROFILE), b""))
+
+
 def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Those before the codestream, and inside of the header: kind and body."""
+    """Kind and body of the boxes before the codestream, those within the header included."""
     place = 0
     while place + 8 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, place)

@@ -38,7 +38,6 @@ _UNSIGNED, _SIGNED, _FLOATING = 1, 2, 3  # SampleFormat
 WORD_DN = 65535.0
 _INK_SET = 332  # 1: cyan, magenta, yellow and black
 _EXIF = 34665  # the tag of an Exif block (Exif 2.3)
-MOST_CHANNELS = 4  # colours and transparency
 _COARSEST_UM = 250.0  # about 100 dpi; 72 and 96 dpi are defaults of programs
 _FINEST_UM = 1.0  # finer than any film scanner
 
@@ -88,6 +87,22 @@ def check_size(
         f"{path} claims {what} of {width} x {height} pixels ({decoded_bytes} bytes), stored in {stored_bytes} bytes: "
         f"{bound}. If it is truly so large, give --max-pixels {pixels}; else the file is damaged: copy it again"
     )
+
+
+@dataclass(frozen=True)
+class PictureForm:
+    """Form of a picture by the head of its file. channels: all that are decoded, transparency included; bits: of a
+    sample."""
+
+    width_px: int
+    height_px: int
+    channels: int
+    bits: int
+
+    def check(self, path: Path, stored_bytes: int, max_pixels: int | None) -> None:
+        """Check the size of a picture that is decoded whole, see `check_size`."""
+        decoded_bytes = self.width_px * self.height_px * self.channels * -(-self.bits // 8)
+        check_size(path, "a picture", (self.width_px, self.height_px), decoded_bytes, stored_bytes, max_pixels)
 
 
 @dataclass(frozen=True)
@@ -174,8 +189,9 @@ class Radiometry:
 
 
 def orientation_tag(page: TiffPage) -> int:
-    """Orientation tag of a page; 1 if it has none."""
-    return int(page.tags.valueof(274, default=1))
+    """Orientation tag of a page; 1 if it has none, or one that is no whole number from 1 to 8."""
+    value = page.tags.valueof(274, default=1)
+    return int(value) if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
 def orientation_notes(orientation: int) -> tuple[str, ...]:

@@ -10,11 +10,27 @@ import numpy as np
 
 from measure.errors import MeasurementError, MissingError
 from measure.scans.cache import LostPart, OpenedPicture, Segments, WholePicture
-from measure.scans.jpeg import JPEG_START, jpeg_camera, jpeg_colour_tags, jpeg_pitch, open_jpeg, picture_form
-from measure.scans.jpeg2000 import JPEG2000_STARTS, jpeg2000_form, jpeg2000_pitch, open_jpeg2000
-from measure.scans.metadata import DECODING_ERRORS, Pitch, Samples, check_size, damage_error
+from measure.scans.jpeg import (
+    BLOCK_PX,
+    JPEG_END,
+    JPEG_START,
+    jpeg_camera,
+    jpeg_colour_tags,
+    jpeg_form,
+    jpeg_pitch,
+    open_jpeg,
+)
+from measure.scans.jpeg2000 import (
+    JPEG2000_END,
+    JPEG2000_STARTS,
+    jpeg2000_colour_tags,
+    jpeg2000_form,
+    jpeg2000_pitch,
+    open_jpeg2000,
+)
+from measure.scans.metadata import DECODING_ERRORS, PictureForm, Pitch, Samples, damage_error
 from measure.scans.parallel import map_in_threads
-from measure.scans.png import PNG_START, open_png, png_colour_tags, png_form, png_pitch
+from measure.scans.png import PNG_END, PNG_START, open_png, png_colour_tags, png_form, png_pitch
 from measure.scans.remote import Address, ScanPart, Window, scan_path
 from measure.scans.scan import Scan
 from measure.scans.tiff import TIFF_STARTS, open_tiff, tiff_colour_tags
@@ -126,8 +142,8 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
         opened = open_tiff(path, max_pixels)
         segments, notes = opened.segments, (*opened.problems, *opened.notes)
         segments.close()
-        bits = int(segments.full_scale_dn + 1).bit_length() - 1
-        return ScanHead("TIFF", segments.width_px, segments.height_px, segments.channels, bits, opened.pitch, notes)
+        size = segments.width_px, segments.height_px
+        return ScanHead("TIFF", *size, segments.channels, opened.bits, opened.pitch, notes)
     try:
         file_bytes = path.stat().st_size
         with path.open("rb") as file:
@@ -136,22 +152,20 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
             end = file.read()
     except OSError as error:
         raise _reading_error(path, error) from error
-    form: tuple[int, int, int, int] | None
+    form: PictureForm | None
     if start == JPEG_START:
-        file_format, form, marker, pitch = "JPEG", picture_form(data), b"\xff\xd9", jpeg_pitch(data)
+        file_format, form, marker, pitch = "JPEG", jpeg_form(data), JPEG_END, jpeg_pitch(data)
     elif start in JPEG2000_STARTS:
-        file_format, own, marker, pitch = "JPEG 2000", jpeg2000_form(data), b"\xff\xd9", jpeg2000_pitch(data)
-        form = None if own is None else (own.width_px, own.height_px, own.channels, own.bits)
+        file_format, form, marker, pitch = "JPEG 2000", jpeg2000_form(data), JPEG2000_END, jpeg2000_pitch(data)
     else:
-        file_format, form, marker, pitch = "PNG", png_form(data), b"IEND", png_pitch(data)
-    if form is None or 0 in form:
+        file_format, form, marker, pitch = "PNG", png_form(data), PNG_END, png_pitch(data)
+    if form is None or 0 in (form.width_px, form.height_px, form.channels, form.bits):
         raise damage_error(path, "its header is cut short")
     if marker not in end:
         open_scan(path, max_pixels).close()  # fails unless the marker only precedes trailing data
-    width, height, channels, bits = form
-    check_size(path, "a picture", (width, height), width * height * channels, file_bytes, max_pixels)
-    camera = jpeg_camera(data) if file_format == "JPEG" else ""
-    return ScanHead(file_format, width, height, min(channels, 3), bits, pitch, camera=camera)
+    form.check(path, file_bytes, max_pixels)
+    camera, channels = jpeg_camera(data) if file_format == "JPEG" else "", 1 if form.channels < 3 else 3
+    return ScanHead(file_format, form.width_px, form.height_px, channels, form.bits, pitch, camera=camera)
 
 
 def declared_tone(path: Path) -> Tone | None:
@@ -161,6 +175,8 @@ def declared_tone(path: Path) -> Tone | None:
             start = opened.read(16)
         if start[:2] in (b"II", b"MM"):
             return tone_of_tags(tiff_colour_tags(path))
+        if start.startswith(JPEG2000_STARTS):
+            return tone_of_tags(jpeg2000_colour_tags(path))
         return tone_of_tags(png_colour_tags(path) if start.startswith(PNG_START) else jpeg_colour_tags(path))
     except (*DECODING_ERRORS, zlib.error):
         return None
@@ -186,7 +202,7 @@ def crop_scan(scan: Scan, window: Window) -> Scan:
     pitch, segments = Pitch(scan.pitch_um, scan.pitch_note), WindowSegments(scan, window)
     opened = OpenedPicture(segments, pitch, scan.notes, scan.problems, orientation=scan.orientation)
     view = Scan(scan.path, segments, pitch, opened).replace_name(scan.name)
-    return view.replace_tone(scan.tone)
+    return view.replace_tone(scan.tone).replace_weights(scan.weights)
 
 
 class WindowSegments(Segments):
@@ -201,13 +217,20 @@ class WindowSegments(Segments):
         self.full_scale_dn = scan.full_scale_dn
         self.sample_bytes = scan.samples_dtype().itemsize
         self.rounding_step_dn = scan.rounding_step_dn
+        (col, row), (first_col, first_row) = scan.origin_px, scan.first_block_px
+        self.origin_px = col + self._col0, row + self._row0
+        self.first_block_px = (first_col - self._col0) % BLOCK_PX, (first_row - self._row0) % BLOCK_PX
 
     @property
     def lost(self) -> Sequence[LostPart]:
-        return tuple(
-            LostPart(part.col0 - self._col0, part.row0 - self._row0, part.width, part.height, part.why)
-            for part in self._scan.lost
-        )
+        """The undecodable parts within the window."""
+        within = list[LostPart]()
+        for part in self._scan.lost:
+            left, top = max(part.col0 - self._col0, 0), max(part.row0 - self._row0, 0)
+            width = min(part.col0 + part.width - self._col0, self.width_px) - left
+            height = min(part.row0 + part.height - self._row0, self.height_px) - top
+            within += [LostPart(left, top, width, height, part.why)] if min(width, height) > 0 else []
+        return tuple(within)
 
     def close(self) -> None:
         """Nothing is open."""

@@ -1,4 +1,4 @@
-"""Paths of scans that are no whole local files: parts of a file, objects in a store, files of a server."""
+"""Paths of scans other than whole local files: parts of a file, objects in a store, files on a server."""
 
 import hashlib
 import os
@@ -24,27 +24,27 @@ _PART = re.compile(r"(.+)#(?=page|window)(?:page=(\d+))?,?(?:window=(\d+),(\d+),
 Made = TypeVar("Made")
 Extent = tuple[int, int]  # first byte, and the byte after the last
 
-_EXTRAS = {"s3": "s3", "http": "http", "https": "http"}  # of reseau, by the scheme of an address
-_BLOCK_BYTES = 1 << 16  # of heads, tags and tables, fetched at a time
-_MOST_BLOCKS = 256  # of an object, held
-_LARGE_READ_BYTES = 4 * _BLOCK_BYTES  # from here on by one request, and not held
-_KEPT_OBJECTS = 8  # whose blocks are held
-_WAITS_S = (0.1, 0.5, 2.0)  # before an address is asked again
-_TIMEOUT_S = 30.0  # without a byte
-_CHECKSUMS = ("ETag", "Content-MD5", "Digest", "Last-Modified")  # of which servers give at least one, mostly
+_EXTRAS = {"s3": "s3", "http": "http", "https": "http"}  # extras of reseau by the scheme of an address
+_BLOCK_BYTES = 1 << 16  # heads, tags and tables are fetched in blocks
+_MOST_BLOCKS = 256  # kept of an object
+_LARGE_READ_BYTES = 4 * _BLOCK_BYTES  # reads of this size and more take one request, and are not kept
+_KEPT_OBJECTS = 8  # objects whose blocks are kept
+_WAITS_S = (0.1, 0.5, 2.0)  # before a request is repeated
+_TIMEOUT_S = 30.0  # without any data
+_CHECKSUMS = ("ETag", "Content-MD5", "Digest", "Last-Modified")  # most servers give at least one
 _SECRET = re.compile(
     r"x-(amz|goog|oss|ms|cos)-.*|.*(token|secret|passw|credential|accesskey|signature|api_?-?key|auth).*|googleaccessid|"
     r"key-pair-id|policy|sig|expires|exp|pwd|hmac|md5|st|se|sp|sr|sv|spr|sip|ss|srt|sk[a-z]{1,3}|sdd|sas|ticket|"
     r"session.*|jwt|hdn.*|user(name)?",
     re.IGNORECASE,
-)  # names of what a query has of a signature, by the stores and servers that are in use
+)  # names of query parameters that belong to a signature, of stores and servers in use
 _ADDRESS = re.compile(r"\b([A-Za-z][A-Za-z0-9+.-]*:/{1,2})([^\s/?#@'\"<>]*@)?([^\s?#'\"<>]*)(\?[^\s'\"<>]*)?")
-_locations: dict[str, str] = {}  # where what is shown of an address is fetched from, with its credentials or signature
+_locations: dict[str, str] = {}  # by public address: the address with its credentials or signature
 
 
 class ScanPart(PosixPath):
-    """`FILE#page=2` or `FILE#page=1,window=100,200,4000,4000`: the path of a file of which one page, or a window of
-    one, is meant. Pages count from 1, pixels as the page stores them."""
+    """Path of one page of a file, or of a window of a page: `FILE#page=2` or `FILE#page=1,window=100,200,4000,4000`.
+    Pages count from 1; the window is first column and row, width and height, as the page stores its pixels."""
 
     def __fspath__(self) -> str:
         return self._groups()[0]
@@ -54,38 +54,38 @@ class ScanPart(PosixPath):
 
     @property
     def page(self) -> int | None:
-        """From 1; None: the first picture."""
+        """Number of the page, from 1; None: the first picture."""
         page = self._groups()[1]
         return int(page) if page else None
 
     @property
     def window(self) -> Window | None:
-        """Of the page; None: all of it."""
+        """Window of the page; None: all of it."""
         col, row, width, height = self._groups()[2:]
         return (int(col), int(row), int(width), int(height)) if col else None
 
     def _groups(self) -> tuple[str, ...]:
         match = _PART.fullmatch(str(self))
-        assert match is not None, f"{self} names no part of a scan: `scan_path` tells"
+        assert match is not None, f"{self} is no part of a scan"
         return match.groups()
 
 
 def whole_file(text: str) -> str:
-    """The file without what is said of its part."""
+    """File name without page and window."""
     match = _PART.fullmatch(text) if "#" in text else None
     return match.group(1) if match else text
 
 
 def part_text(file: str, page: int | None, window: Window | None) -> str:
-    """What `ScanPart` reads."""
+    """Text of a `ScanPart`."""
     parts = [f"page={page}"] if page else []
     parts += [f"window={','.join(map(str, window))}"] if window else []
     return f"{file}#{','.join(parts)}" if parts else file
 
 
 def public_address(text: str) -> str:
-    """An address as it may be shown and kept: without user and password, and without a signature, so that another
-    signature is the same address. What else its query says stands there as a hash; any other text as it is."""
+    """Address that may be shown and stored: without user, password and signature, so that it does not change with the
+    signature. The rest of its query is replaced by a hash. Any other text is returned unchanged."""
     if not is_address(text):
         return text
     scheme, _, rest = text.partition("://")
@@ -97,12 +97,12 @@ def public_address(text: str) -> str:
 
 
 def public_text(text: str) -> str:
-    """A text with all addresses in it without user, password and query."""
+    """Text with user, password and query removed from all its addresses."""
     return _ADDRESS.sub(r"\1\3", text) if ":/" in text else text
 
 
 def _register(segment: Any) -> Any:
-    """What is shown of an address; where it is fetched from is remembered."""
+    """Return the public form of an address and remember its location, with credentials."""
     if not isinstance(segment, str) or not is_address(segment):
         return segment
     shown = public_address(segment)
@@ -112,12 +112,12 @@ def _register(segment: Any) -> Any:
 
 
 class Address(PosixPath):
-    """`s3://bucket/key`, `https://host/path` or `http://host/path`: a path whose file stands elsewhere.
+    """Path of a remote file: `s3://bucket/key`, `https://host/path` or `http://host/path`.
 
-    As a text it has no user, password or signature; `location` has them, for those who fetch it.
+    Its text has no user, password or signature; `location` has them.
 
-    Its methods raise MissingError where nothing is there, UnreachableError where that cannot be told or read after some
-    tries, and MeasurementError where the extra of reseau that reaches it is not installed.
+    Its methods raise MissingError if there is no such file, UnreachableError if it cannot be read after several tries,
+    and MeasurementError if the extra of reseau for its scheme is not installed.
     """
 
     def __new__(cls, *segments: Any) -> "Address":
@@ -130,7 +130,7 @@ class Address(PosixPath):
 
     @property
     def location(self) -> str:
-        """The address with all that it takes to fetch it."""
+        """Address with credentials or signature, to fetch it by."""
         return _locations.get(str(self), str(self))
 
     def __str__(self) -> str:
@@ -144,11 +144,11 @@ class Address(PosixPath):
 
     @property
     def etag(self) -> str:
-        """What the store calls this content of it; "" where it says nothing. Asked for anew."""
+        """Checksum or date of the content by the store, requested anew; "" if it gives none."""
         return _query_object(self).etag
 
     def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
-        """Its size, asked for anew; nothing else of it is known."""
+        """Status with the size, requested anew; all other fields are 0."""
         return os.stat_result((stat.S_IFREG, 0, 0, 0, 0, 0, _query_object(self).size, 0, 0, 0))
 
     def exists(self, *, follow_symlinks: bool = True) -> bool:
@@ -170,17 +170,17 @@ class Address(PosixPath):
     def resolve(self, strict: bool = False) -> "Address":
         return self
 
-    def open(self, *args: Any, **kwargs: Any) -> Any:  # whose modes are those of files
-        """As a file opened with "rb", for reading bytes: of heads, tags and tables, for what is read is held."""
+    def open(self, *args: Any, **kwargs: Any) -> Any:  # any modes, as for files
+        """Open for reading bytes. The blocks read are kept, so this is meant for heads, tags and tables."""
         return _RemoteFile(self)
 
     def read_bytes(self) -> bytes:
-        """All of it, by one request."""
+        """Read the whole file by one request."""
         (data,) = self.ranges([(0, _remote_object(self).size)])
         return data
 
     def ranges(self, extents: Sequence[Extent]) -> list[bytes]:
-        """The bytes of several places, asked for together."""
+        """Read the bytes of several extents, requested together."""
         system = _file_system(self)
         starts, ends = [first for first, _ in extents], [after for _, after in extents]
 
@@ -216,7 +216,7 @@ _holding = Lock()
 
 
 def scan_path(text: str | Path) -> Path:
-    """The file or the address that a text names, or the part of a file."""
+    """Path of a file, of a part of a file, or an address, from its text."""
     if isinstance(text, Path):
         return text
     kind = ScanPart if _PART.fullmatch(text) else Address if is_address(text) else Path
@@ -224,7 +224,8 @@ def scan_path(text: str | Path) -> Path:
 
 
 def fetch_location(path: str | Path) -> str:
-    """A text by which a file or an address can be opened, in another process, too. It is not to be shown or kept."""
+    """Text by which a file or an address can be opened in any process. It may hold credentials: do not show or store
+    it."""
     known = scan_path(path)
     return known.location if isinstance(known, Address) else str(path)
 
@@ -235,7 +236,7 @@ def is_address(text: str) -> bool:
 
 
 def find_addresses(pattern: str) -> list[Path]:
-    """Finds the objects of a pattern in a store.
+    """Find the objects of a store that match a pattern.
 
     Parameters
     ----------
@@ -255,7 +256,7 @@ def find_addresses(pattern: str) -> list[Path]:
 
 
 def list_addresses(address: Address) -> list[Path]:
-    """Lists every object of a store below an address, at any depth, or every file that a server's pages list there.
+    """List every object of a store below an address, at any depth, or every file listed on a server's pages there.
 
     Raises
     ------
@@ -279,7 +280,7 @@ def list_addresses(address: Address) -> list[Path]:
 
 @dataclass
 class _RemoteObject:
-    """An object in a store: its size, the checksum of its content, and fsspec's cache of its blocks."""
+    """Object in a store: size, checksum of its content, and fsspec's cache of its blocks."""
 
     size: int
     etag: str
@@ -290,7 +291,7 @@ _objects: OrderedDict[str, _RemoteObject] = OrderedDict()
 
 
 class _RemoteFile(BufferedIOBase):
-    """An address as a file that is read by blocks."""
+    """Remote file, read by blocks."""
 
     def __init__(self, address: Address) -> None:
         self.name, self._address, self._object, self._place = str(address), address, _remote_object(address), 0
@@ -319,14 +320,14 @@ class _RemoteFile(BufferedIOBase):
 
 
 def _remote_object(address: Address) -> _RemoteObject:
-    """The object as it was when its size was last requested."""
+    """Object as known from the last request of its size."""
     with _holding:
         known = _objects.get(str(address))
     return _query_object(address) if known is None else known
 
 
 def _query_object(address: Address) -> _RemoteObject:
-    """Requests size and checksum anew; blocks of an unchanged content are kept."""
+    """Request size and checksum anew; blocks of an unchanged content are kept."""
     system = _file_system(address)
     info: Mapping[str, Any] = _retry(address, lambda: system.info(address.location))
     size, etag = info.get("size"), next((str(info[key]) for key in _CHECKSUMS if info.get(key)), "")
@@ -348,7 +349,7 @@ def _query_object(address: Address) -> _RemoteObject:
 
 
 def _retry(address: Address, ask: Callable[[], Made]) -> Made:
-    """Repeats a request that fails, also one that is forbidden: a busy store answers so now and then."""
+    """Repeat a request that fails. Forbidden ones are repeated, too, since busy stores sometimes refuse requests."""
     for wait_s in (*_WAITS_S, None):
         try:
             return ask()
@@ -357,8 +358,7 @@ def _retry(address: Address, ask: Callable[[], Made]) -> Made:
         except Exception as caught:  # each of fsspec's libraries has its own
             error: BaseException = caught
             if isinstance(error, FileNotFoundError):
-                # fsspec takes whatever a server refuses for a file that is not there, and names the refusal as the
-                # cause.
+                # fsspec reports any refusal of a server as a missing file, with the refusal as its cause.
                 error = error.__cause__ or error
                 if isinstance(error, FileNotFoundError) or _status(error) == 404:
                     message = f"there is no {address}: check its name, and that its server has it"
@@ -378,7 +378,7 @@ def _explanation(error: BaseException) -> str:
 
 
 def _status(error: BaseException) -> int | None:
-    """The answer of a server, as aiohttp has it."""
+    """HTTP status code of an error of aiohttp."""
     return getattr(error, "status", None)
 
 
@@ -387,7 +387,7 @@ def _scheme(address: Address) -> str:
 
 
 def _file_system(address: Address) -> Any:
-    """fsspec's, which keeps one for each scheme."""
+    """File system of fsspec for the address's scheme, which fsspec caches."""
     scheme = _scheme(address)
     try:
         fsspec = import_module("fsspec")

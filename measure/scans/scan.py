@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from measure.array_types import Single
 from measure.scans.cache import LostPart, OpenedPicture, SegmentCache, Segments
-from measure.scans.jpeg import earlier_step_dn
+from measure.scans.jpeg import BLOCK_PX, earlier_compression
 from measure.scans.metadata import Pitch, Samples
 from measure.scans.parallel import map_in_threads
 from measure.scans.remote import ScanPart, Window
@@ -51,6 +51,7 @@ class Scan:
     pitch_um : (x, y) from the resolution tags; None where there are no credible ones, for the reason in pitch_note.
     problems : problems of the file, one sentence each.
     orientation : see `OpenedPicture`.
+    origin_px : column and row of the first pixel in the picture of the file; (0, 0) but for a window of it.
     """
 
     def __init__(self, path: Path, segments: Segments, pitch: Pitch, opened: OpenedPicture | None = None) -> None:
@@ -66,6 +67,7 @@ class Scan:
         self.pitch_note = pitch.note
         self.problems = opened.problems
         self.orientation = opened.orientation
+        self.origin_px = segments.origin_px
         self.tone = LINEAR
         self._file_notes = opened.notes
         self._segments = segments
@@ -78,7 +80,12 @@ class Scan:
     @cached_property
     def rounding_step_dn(self) -> float:
         """Quantisation step of coarse detail by lossy compression, of the file or an earlier one; 0 without any."""
-        return max(self._segments.rounding_step_dn, self._earlier_step_dn)
+        return max(self._segments.rounding_step_dn, self._earlier[0])
+
+    @property
+    def first_block_px(self) -> tuple[int, int]:
+        """Column and row, 0 to 7, at which the first whole block of 8 x 8 px of the compression begins."""
+        return self._earlier[1] if self._earlier[0] else self._segments.first_block_px
 
     @property
     def is_lossy(self) -> bool:
@@ -87,11 +94,11 @@ class Scan:
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes on the file, one sentence each."""
-        if not self._earlier_step_dn:
+        if not self._earlier[0]:
             return self._file_notes
         return *self._file_notes, (
             "the picture was compressed as JPEG before it was stored as it is (to steps of some"
-            f" {self._earlier_step_dn:.0f} grey values): its marks have the larger standard deviations of such a file"
+            f" {self._earlier[0]:.0f} grey values): its marks have the larger standard deviations of such a file"
         )
 
     @cached_property
@@ -218,11 +225,13 @@ class Scan:
 
     @property
     def damage(self) -> str:
-        """Damage of the file found so far, a part of a sentence; empty without any."""
+        """Damage found so far, with its rows in the file, a part of a sentence; empty without any."""
         lost = self._segments.lost
         if not lost:
             return ""
-        places = "; ".join(f"rows {part.row0} to {part.row0 + part.height - 1}, {part.why}" for part in lost[:_NAMED])
+        firsts = [part.row0 + self.origin_px[1] for part in lost[:_NAMED]]
+        named = zip(firsts, lost, strict=False)
+        places = "; ".join(f"rows {first} to {first + part.height - 1}, {part.why}" for first, part in named)
         more = f"; and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
         what = (
             f"nothing of it can be trusted ({lost[0].why})"
@@ -238,12 +247,11 @@ class Scan:
         dropped. The scan is streamed by segments: memory holds the result, all its channels for the next call, and some
         segments for each thread.
         """
-        height, width = self.height_px // factor, self.width_px // factor
-        if factor < 1 or height < 1 or width < 1:
+        if not 1 <= factor <= min(self.height_px, self.width_px):
             raise ValueError(f"{self.name}: cannot be reduced by {factor}: it is {self.width_px} x {self.height_px} px")
         if factor not in self._reduced:
             self._reduced.clear()
-            self._reduced[factor] = self._reduced_channels(factor, width, height)
+            self._reduced[factor] = self._reduced_channels(factor, self.width_px // factor, self.height_px // factor)
         return weighted(self._reduced[factor], self._weights(weights))
 
     @property
@@ -283,18 +291,21 @@ class Scan:
         ]
 
     @cached_property
-    def _earlier_step_dn(self) -> float:
-        """Quantisation step of an earlier JPEG compression, from the luminance in the centre of the scan; 0 if it is
-        not clearly coarser than the file's. JPEG has 8 bits: in a file of 16 bits its values are multiples of a
-        unit."""
+    def _earlier(self) -> tuple[float, tuple[int, int]]:
+        """Quantisation step of an earlier JPEG compression, from the luminance in the centre of the scan, and the first
+        column and row of a block of it; 0 if the step is not clearly coarser than the file's. JPEG has 8 bits: in a
+        file of 16 bits its values are multiples of a unit."""
+        none = 0.0, (0, 0)
         width, height = (min(side, _COMPRESSION_PX) for side in (self.width_px, self.height_px))
-        samples = self.samples((self.width_px - width) // 2, (self.height_px - height) // 2, width, height)
+        col0, row0 = (self.width_px - width) // 2, (self.height_px - height) // 2
+        samples = self.samples(col0, row0, width, height)
         unit = 1 if samples.dtype == np.uint8 else int(np.gcd.reduce(samples, axis=None))
         if samples.dtype != np.uint8 and unit < _LEAST_UNIT_DN:
-            return 0.0
+            return none
         luminance = weighted(samples, LUMINANCE if self.channels > 1 else (1.0,))
-        step_dn = unit * earlier_step_dn(luminance / np.float32(unit))
-        return step_dn if step_dn > _PLAINLY_COARSER * self._segments.rounding_step_dn else 0.0
+        step_dn, (col, row) = earlier_compression(luminance / np.float32(unit))
+        is_coarser = unit * step_dn > _PLAINLY_COARSER * self._segments.rounding_step_dn
+        return (unit * step_dn, ((col0 + col) % BLOCK_PX, (row0 + row) % BLOCK_PX)) if is_coarser else none
 
     def _reduced_channels(self, factor: int, width: int, height: int) -> Single:
         """(height, width, channels) reduction of the whole scan; every segment is decoded once."""

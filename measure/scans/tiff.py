@@ -1,9 +1,9 @@
-"""TIFF and BigTIFF files opened: their directories checked before they are believed, and their picture of full size.
+"""TIFF and BigTIFF files: checks of their directories, and their full-size picture.
 
-TIFF 6.0, section 2, and BigTIFF: a directory is a number of entries and the place of the next one; an entry is a tag,
-the type and the count of its numbers, and these themselves or, where they take more room, their place.
+TIFF 6.0, section 2, and BigTIFF: a directory is a number of entries and the place of the next directory; an entry is a
+tag, the type and count of its numbers, and the numbers themselves or, if they do not fit, their place.
 
-Tiles and strips are decoded each on its own: what is damaged in one costs none of the others.
+Tiles and strips are decoded separately: damage of one does not affect the others.
 """
 
 import logging
@@ -42,45 +42,43 @@ from measure.scans.metadata import (
     tag_pitch,
     unsupported_error,
 )
-from measure.scans.remote import Address, ScanPart
+from measure.scans.remote import Address, Extent, ScanPart
 from measure.tone.declared import ColourTags
-
-Extent = tuple[int, int]
 
 _MOST_DIRECTORIES, _MOST_TAGS = 1000, 4096  # of a file and of a directory: more are damage
 _WHOLE = (1, 3, 4, 13, 16, 18)  # types of unsigned integers
 _TYPE_BYTES = {int(kind): struct.calcsize(f"={form}") for kind, form in TIFF.DATA_FORMATS.items()}
-# What is read with a picture: tags of one number, and of several.
+# Tags needed to read a picture: those with one number, and those with several.
 _ONE_NUMBER = frozenset((254, 256, 257, 259, 262, 266, 274, 277, 278, 284, 317, 322, 323))
 _NUMBERS = frozenset((258, 273, 279, 320, 324, 325, 338, 339))
 _SIZES = (256, 257, 277, 278, 322, 323)  # none of which may be 0
 _SUB_IFDS, _CHILDREN = 330, (34665, 34853, 40965)  # tags of further directories; Exif, GPS, Interoperability
-_STORED = ((273, 279), (324, 325), (513, 514))  # places and numbers of bytes of what no tag holds itself
+_STORED = ((273, 279), (324, 325), (513, 514))  # tags with places and byte counts of data outside of the directory
 _TRANSFER_FUNCTION, _ICC_PROFILE = 301, 34675  # tags of the tone curve (TIFF 6.0; ICC.1:2022, B.4)
-logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it finds odd is said in our own messages
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # our own messages cover its warnings
 
 TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the first bytes of TIFF and BigTIFF files
 _UNCOMPRESSED = 1  # of Compression (TIFF 6.0)
-_LOOKED_AT_BYTES = 1 << 16  # after the last that a file accounts for
-_JPEG_HEADERS_BYTES = 4096  # tables, size and resolution take fewer
+_LOOKED_AT_BYTES = 1 << 16  # checked after the last extent of a file
+_JPEG_HEADERS_BYTES = 4096  # tables, size and resolution need fewer
 _REDUCED_IMAGE, _NOT_WHOLE = 1, 1 | 4  # bits of NewSubfileType: reduced, and reduced or a transparency mask
 _ALPHA = (1, 2)  # of ExtraSamples: associated and unassociated transparency
-_FULL_SIZE = 0.6  # of the largest picture's side: what is smaller is an overview
+_FULL_SIZE = 0.6  # fraction of the largest picture's side: a smaller picture is an overview
 _INTO_MEMORY = (5, 8, 32773, 32946, 34926, 50000)  # LZW, deflate, PackBits, zstd: these give bytes
 _FLOAT_PREDICTOR = 3  # of Predictor (TIFF Technical Note 3)
-_MAPPED_BYTES = 4 << 20  # of an uncompressed file, taken at a time; larger tiles and strips are not copied
+_MAPPED_BYTES = 4 << 20  # read at a time from an uncompressed file; larger tiles and strips are not copied
 
 
 class BadDirectory(ValueError):
-    """What is wrong with a file's directories, a part of a sentence."""
+    """Damage of a file's directories; the message is a part of a sentence."""
 
 
 def check_directories(file: TiffFile) -> list[Extent]:
-    """What lies where in the file, (first byte, byte after the last) each: the directories, the numbers of their tags,
-    and the pixels that these tell of.
+    """Check a file's directories and list the occupied extents, (first byte, byte after the last) each: directories,
+    the numbers of their tags, and pixels.
 
-    Raises BadDirectory for a chain of directories that leads back to itself, and for tags of a count, type or value
-    that no picture can have.
+    Raises BadDirectory for a chain of directories that leads back to itself, and for tags with a count, type or value
+    that is impossible for a picture.
     """
     file.filehandle.seek(file.tiff.offsetsize if file.is_bigtiff else 4)
     chain = [_number(file, file.tiff.offsetformat)]
@@ -100,7 +98,7 @@ def check_directories(file: TiffFile) -> list[Extent]:
         except BadDirectory:
             if is_picture:
                 raise
-            continue  # what is beside the pictures is not read
+            continue  # directories other than pictures are not needed
         chain += [following] if is_picture else []
         children += [number for tag in tags if tag.code == _SUB_IFDS for number in _numbers(tag)]
         children += [tag.valueoffset for tag in tags if tag.code in _CHILDREN]
@@ -116,7 +114,7 @@ def _number(file: TiffFile, form: str) -> int:
 
 
 def _directory(file: TiffFile, place: int, is_picture: bool) -> tuple[list[TiffTag], int]:
-    """A directory's tags, and the place of the next one. Of a picture, those that it is read by are checked."""
+    """Read a directory's tags and the place of the next directory; check the tags needed to read a picture."""
     file.filehandle.seek(place)
     count = _number(file, file.tiff.tagnoformat)
     if count > _MOST_TAGS:
@@ -143,7 +141,7 @@ def _directory(file: TiffFile, place: int, is_picture: bool) -> tuple[list[TiffT
 
 
 def _extents(tags: Sequence[TiffTag], file: TiffFile) -> Iterator[Extent]:
-    """Of the numbers of a directory's tags, and of the pixels that they tell of."""
+    """List the extents of the numbers of a directory's tags, and of the pixels to which they point."""
     for tag in tags:
         size = tag.count * _TYPE_BYTES.get(int(tag.dtype), 0)
         if size > file.tiff.tagoffsetthreshold:
@@ -156,30 +154,30 @@ def _extents(tags: Sequence[TiffTag], file: TiffFile) -> Iterator[Extent]:
 
 
 def _numbers(tag: TiffTag) -> list[int]:
-    """None where the tag holds no whole numbers, or the file does not hold them."""
+    """Numbers of a tag; empty if they are not whole numbers, or lie beyond the end of the file."""
     if tag.dtype not in _WHOLE or tag.valueoffset + tag.valuebytecount > tag.parent.filehandle.size:
         return []
     return [int(number) for number in np.ravel(tag.value)]
 
 
 def open_tiff(path: Path, max_pixels: int | None) -> OpenedPicture:
-    """The first full-resolution picture of a TIFF file, or that of the page that the path names.
+    """Open the first full-resolution picture of a TIFF file, or the page that the path names.
 
-    Of an address the overviews are opened, too. Of a local file the picture itself is averaged, for how others averaged
-    is not known. Raises MeasurementError for a truncated file, for pictures of a kind that `page_radiometry` does not
-    know, and for those that claim more than such a file can hold.
+    Overviews are opened for addresses only. For a local file the picture itself is averaged, since it is unknown how
+    another program averaged. Raises MeasurementError for a truncated file, for pictures of a kind that
+    `page_radiometry` does not know, and for sizes that exceed the limits of `check_size`.
     """
     try:
         file = _tiff_file(path)
     except DECODING_ERRORS as error:
-        # Others than these are of tags that are no numbers, or several.
+        # Other errors come from tags that are not numbers, or hold several.
         reason = str(error) if isinstance(error, OSError | TiffFileError) else "its list of tags is damaged"
         raise damage_error(path, reason) from error
     try:
         taken = check_directories(file)
         page, problems = _main_page(file, path)
         if re.match(r'\s*\{"reseau": .*"pitch_mm": ', page.description):
-            # In a resampled frame the film is gone from the marks' places, and the noise from their uncertainty.
+            # A resampled frame lacks the film's deformation, and its noise no longer gives the marks' uncertainty.
             raise MeasurementError(
                 f"{path}: is a frame that reseau has resampled, and no scan. Measure the scan that it was made of."
             )
@@ -193,7 +191,8 @@ def open_tiff(path: Path, max_pixels: int | None) -> OpenedPicture:
         overviews = _overviews(file, page, path) if isinstance(path, Address) else ()
         orientation = orientation_tag(page)
         notes = (*orientation_notes(orientation), *_band_notes(page, radiometry))
-        return OpenedPicture(segments, tag_pitch(page), notes, problems, overviews, orientation)
+        bits = page.bitspersample
+        return OpenedPicture(segments, tag_pitch(page), notes, problems, overviews, orientation, bits)
     except DECODING_ERRORS as error:
         file.close()
         raise damage_error(path, str(error)) from error
@@ -203,12 +202,12 @@ def open_tiff(path: Path, max_pixels: int | None) -> OpenedPicture:
 
 
 def _tiff_file(path: Path) -> TiffFile:
-    """A TIFF file opened, wherever it is. Raises one of DECODING_ERRORS, or as `Address` does."""
+    """Open a local or remote TIFF file. Raises one of DECODING_ERRORS, or as `Address` does."""
     return TiffFile(path.open("rb") if isinstance(path, Address) else path)
 
 
 def _main_page(file: TiffFile, path: Path) -> tuple[TiffPage, tuple[str, ...]]:
-    """The page that the path names, or else the first one that is a picture; and what it leaves out."""
+    """Page that the path names, or else the first picture; and problems, one sentence each, if there are others."""
     pictures = _full_pictures(file)
     if not pictures:
         raise damage_error(path, "it holds no picture")
@@ -230,12 +229,11 @@ def _main_page(file: TiffFile, path: Path) -> tuple[TiffPage, tuple[str, ...]]:
 
 
 def _full_pictures(file: TiffFile) -> dict[int, list[TiffPage]]:
-    """The pictures of each page, from 1, and of its SubIFDs, the largest first, without masks and without what is small
-    beside others, a thumbnail or an overview, whether the file says so or not."""
+    """Full-size pictures by the number of their page, from 1: of the page and its SubIFDs, the largest first. Masks,
+    thumbnails and overviews are left out, also where the file does not declare them as such."""
     held: dict[int, list[TiffPage]] = {}
     for number, page in enumerate((page.aspage() for page in file.pages), 1):
-        below = page.pages if page.subifds and page.pages is not None else ()
-        whole = [one for one in (page, *(one.aspage() for one in below)) if not int(one.subfiletype) & _NOT_WHOLE]
+        whole = [one for one in (page, *_pages_below(page)) if not int(one.subfiletype) & _NOT_WHOLE]
         own = [one for one in whole if one.imagewidth > 0 and one.imagelength > 0]
         held[number] = sorted(own, key=_mean_side, reverse=True)
     side = max((_mean_side(page) for own in held.values() for page in own), default=0.0)
@@ -243,12 +241,17 @@ def _full_pictures(file: TiffFile) -> dict[int, list[TiffPage]]:
     return {number: own for number, own in full.items() if own}
 
 
+def _pages_below(page: TiffPage) -> list[TiffPage]:
+    """SubIFDs of a page."""
+    return [one.aspage() for one in page.pages] if page.subifds and page.pages is not None else []
+
+
 def _mean_side(page: TiffPage) -> float:
     return math.sqrt(page.imagewidth * page.imagelength)
 
 
 def _band_notes(page: TiffPage, radiometry: Radiometry) -> tuple[str, ...]:
-    """Which of several bands is used; transparency is none."""
+    """Notes on the bands used, if the picture has more; transparency does not count."""
     bands = page.samplesperpixel - sum(int(kind) in _ALPHA for kind in page.extrasamples)
     notes = (radiometry.note,) if radiometry.note else ()
     if bands <= max(radiometry.bands, radiometry.channels):
@@ -260,12 +263,11 @@ def _band_notes(page: TiffPage, radiometry: Radiometry) -> tuple[str, ...]:
 
 
 def _overviews(file: TiffFile, full: TiffPage, path: Path) -> tuple[Segments, ...]:
-    """The same picture made small: further pages, or below the page itself, with the full picture's samples, and its
-    sides but for a factor and what is left of a pixel."""
-    below = full.pages if full.subifds and full.pages is not None else ()
+    """Open the reduced copies of the picture: other pages or SubIFDs with the same kind of samples and, within a pixel,
+    the same ratio of sides."""
     samples = full.bitspersample, full.samplesperpixel, full.photometric
     small = list[TiffPage]()
-    for page in (page.aspage() for page in (*file.pages, *below)):
+    for page in (*(page.aspage() for page in file.pages), *_pages_below(full)):
         is_reduced = int(page.subfiletype) & _NOT_WHOLE == _REDUCED_IMAGE
         if not is_reduced or (page.bitspersample, page.samplesperpixel, page.photometric) != samples:
             continue
@@ -277,7 +279,7 @@ def _overviews(file: TiffFile, full: TiffPage, path: Path) -> tuple[Segments, ..
 
 
 def _check_sizes(page: TiffPage, path: Path, max_pixels: int | None) -> None:
-    """Of the picture, and of its largest tile or strip."""
+    """Check the sizes of the picture and of its largest tile."""
     pixel_bytes = page.samplesperpixel * -(-page.bitspersample // 8)
     size = page.imagewidth, page.imagelength
     file_bytes = path.stat().st_size
@@ -290,10 +292,10 @@ def _check_sizes(page: TiffPage, path: Path, max_pixels: int | None) -> None:
 
 
 def _check_extent(page: TiffPage, path: Path, taken: list[Extent]) -> None:
-    """A file whose tiles or strips lie beyond its end is truncated: better said now than at the last window. Where
-    nothing but the pixels is stored, wrong places show nowhere else: by what is taken twice, and what by nothing.
+    """Refuse a file whose tiles or strips lie beyond its end: it is truncated.
 
-    taken: what lies where, by all tags of the file.
+    In an uncompressed picture wrong places show in no other way, so that extents that overlap, and bytes that belong to
+    no extent, are refused, too. taken: extents by all tags of the file.
     """
     size = path.stat().st_size
     stored = [
@@ -317,7 +319,7 @@ def _check_extent(page: TiffPage, path: Path, taken: list[Extent]) -> None:
     if lies_over:
         raise damage_error(path, f"its {part} lie over one another or over its tags")
     if any(other.offset >= ends[-1] for other in page.parent.pages):
-        return  # another picture's tags stand behind the pixels, where they are said to: nothing was put in before them
+        return  # another picture's tags lie after the pixels, where expected: no bytes were inserted before them
     with path.open("rb") as file:
         last = max(end for _, end in taken)
         file.seek(last)
@@ -328,7 +330,8 @@ def _check_extent(page: TiffPage, path: Path, taken: list[Extent]) -> None:
 
 
 def _page_rounding_step_dn(file: TiffFile, page: TiffPage) -> float:
-    """Of a page compressed as JPEG: its tables stand in a tag, or else at the beginning of every tile or strip."""
+    """Quantisation step of a page compressed as JPEG, else 0. Its tables are in a tag, or at the beginning of every
+    tile or strip."""
     if page.compression not in JPEG_COMPRESSIONS:
         return 0.0
     start = page.jpegtables or page.jpegheader
@@ -340,7 +343,7 @@ def _page_rounding_step_dn(file: TiffFile, page: TiffPage) -> float:
 
 
 def tiff_colour_tags(path: Path) -> ColourTags:
-    """What the tags of a TIFF file's first page say of its tone curve. Raises one of DECODING_ERRORS."""
+    """Read the tags of a TIFF file's first page that declare its tone curve. Raises one of DECODING_ERRORS."""
     with _tiff_file(path) as file:
         page = file.pages.first.aspage()
         profile, transfer = page.tags.valueof(_ICC_PROFILE), page.tags.valueof(_TRANSFER_FUNCTION)
@@ -385,8 +388,8 @@ class TiffSegments(Segments):
             self._check_bytes()
 
     def _check_bytes(self) -> None:
-        """What tags of an uncompressed picture say of its size is held against the bytes that there are: rows that
-        begin at wrong places look like rows."""
+        """Compare the size of an uncompressed picture by its tags with its number of bytes: rows read from wrong places
+        look like rows."""
         wide, tall = self._row_bytes, self.segment_height_px
         rows = self._grid[1] * self._planes * (self._grid[0] * tall if self._page.is_tiled else self.height_px)
         stored = sum(count or tall * wide for count in self._page.databytecounts)
@@ -396,11 +399,11 @@ class TiffSegments(Segments):
 
     @property
     def lost(self) -> Sequence[LostPart]:
-        """The tiles and strips that could not be decoded."""
+        """Tiles and strips that could not be decoded."""
         return tuple(self._lost.values())
 
     def fetch(self, places: Sequence[Place]) -> Mapping[Place, Sequence[bytes]]:
-        """Of an address, by one request for all; a local file is read as each segment is decoded."""
+        """Fetch segments of an address by one request; those of a local file are read when they are decoded."""
         if self._address is None or not places:
             return {}
         indices = [self._indices(*place) for place in places]
@@ -410,12 +413,12 @@ class TiffSegments(Segments):
         return {place: [next(parts) for _ in own] for place, own in zip(places, indices, strict=True)}
 
     def _indices(self, row: int, column: int) -> list[int]:
-        """Of a segment's tiles or strips, one for each plane."""
+        """Indices of a segment's tiles or strips, one for each plane."""
         rows, columns = self._grid
         return [row * columns + column + plane * rows * columns for plane in range(self._planes)]
 
     def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
-        """Segment (row, column): the planes of a file that keeps them apart are put together."""
+        """Decode segment (row, column); separate planes are joined."""
         height = min(self.segment_height_px, self.height_px - row * self.segment_height_px)
         width = min(self.segment_width_px, self.width_px - column * self.segment_width_px)
         indices = self._indices(row, column)
@@ -436,7 +439,7 @@ class TiffSegments(Segments):
         return self._values(samples[:height, :width])
 
     def _values(self, stored: NDArray[np.generic]) -> Samples:
-        """Values of stored numbers; of floating-point ones all are read once for their scale."""
+        """Convert stored numbers to values. The scale of floating-point numbers takes one pass over the picture."""
         if self._is_float:
             with self._spanning:
                 if self._radiometry.span is None:
@@ -444,11 +447,11 @@ class TiffSegments(Segments):
         return self._radiometry.apply(stored)
 
     def _float_span(self) -> tuple[float, float]:
-        """Floating-point numbers that map to 0 and full scale: the smallest usual scale that holds all finite ones of
-        the picture, else the extremes; what cannot be decoded is passed over."""
+        """Floating-point numbers that map to 0 and full scale: the smallest usual scale that holds all finite numbers
+        of the picture, else the extremes. Undecodable parts are ignored."""
         extremes = list[float]()
         page = TiffSegments(self._file, self._page, self._path, self._radiometry, self.rounding_step_dn)
-        page._reading = self._reading  # both move the place in one file, in several threads
+        page._reading = self._reading  # threads of both move the position in one file
         rows, columns = page._grid
         for row, column in product(range(rows), range(columns)):
             height = min(page.segment_height_px, self.height_px - row * page.segment_height_px)
@@ -463,9 +466,8 @@ class TiffSegments(Segments):
         return low, next(usual, max(greatest, low + 1e-9))
 
     def _decode(self, index: int, given: bytes | None, height_px: int, width_px: int) -> NDArray[np.generic]:
-        """(height, width, samples) of the stored numbers, height_px by width_px or more of them; a tile that was left
-        out of the file is all zeros. given: what is stored of it, None where it is still to be read. Raises one of
-        DECODING_ERRORS."""
+        """Decode a tile or strip: (height, width, samples) stored numbers, at least height_px by width_px; zeros for a
+        tile that the file omits. given: its bytes, None to read them. Raises one of DECODING_ERRORS."""
         page = self._page
         if not page.databytecounts[index]:
             return np.zeros((height_px, self.segment_width_px, self._samples), page.dtype)
@@ -505,8 +507,7 @@ class TiffSegments(Segments):
         return samples.reshape(*samples.shape[:2], self._samples)
 
     def _decode_bytes(self, data: bytes | NDArray[np.uint8], height_px: int) -> NDArray[np.generic]:
-        """The numbers of a tile or strip that holds rows of bytes, each row from a byte of its own. The last strip may
-        be as tall as the others."""
+        """Decode a tile or strip of rows that begin at whole bytes. The last strip may be as tall as the others."""
         page, shape = self._page, (-1, self.segment_width_px, self._samples)
         if page.fillorder == 2:
             data = bytes(imagecodecs.bitorder_decode(bytes(data)))
@@ -514,8 +515,8 @@ class TiffSegments(Segments):
         if page.compression == _UNCOMPRESSED:
             stored = np.frombuffer(data, np.uint8)
         else:
-            # NumPy's memory comes by large pages, which takes a quarter less time than the decoder's own. A byte more
-            # than what is right tells a stream that holds more.
+            # NumPy allocates large pages, which takes a quarter less time than the decoder's own memory. One byte more
+            # than needed shows a stream that holds too much.
             memory = np.empty(full + 1, np.uint8)
             stored = memory[: len(TIFF.DECOMPRESSORS[page.compression](data, out=memory))]
         right = (full,) if page.is_tiled else (full, height_px * self._row_bytes)
@@ -532,8 +533,8 @@ class TiffSegments(Segments):
         return np.asarray(numbers if page.predictor == 1 else TIFF.UNPREDICTORS[page.predictor](numbers, axis=-2))
 
     def _stored_bytes(self, index: int) -> bytes | NDArray[np.uint8]:
-        """A tile or strip as the file has it: mapped where it is so large that a copy would take long, for a mapping
-        takes longer than the copy of a small one."""
+        """Read the stored bytes of a tile or strip. Large ones are mapped instead of copied; for small ones a copy is
+        quicker."""
         offset, size = self._page.dataoffsets[index], self._page.databytecounts[index]
         if self._address is not None:
             return self._address.ranges([(offset, offset + size)])[0]
@@ -548,8 +549,7 @@ class TiffSegments(Segments):
 
 
 class RawRows(TiffSegments):
-    """An uncompressed file whose rows stand one after the other: any part can be read, whatever its strips, and none
-    need be kept."""
+    """Uncompressed file with its rows in order: any part is read directly, regardless of strips, and not cached."""
 
     def __init__(
         self, file: TiffFile, page: TiffPage, path: Path, radiometry: Radiometry, rounding_step_dn: float
@@ -563,7 +563,7 @@ class RawRows(TiffSegments):
         return samples
 
     def fill(self, samples: Samples, row0: int, col0: int) -> None:
-        """Samples (height, width, channels) of the picture from a row and column on."""
+        """Fill samples (height, width, channels) with the part of the picture that begins at a row and column."""
         at_a_time = max(_MAPPED_BYTES // self._row_bytes, 1)
         for first in range(0, len(samples), at_a_time):
             part, row = samples[first : first + at_a_time], row0 + first
@@ -571,8 +571,8 @@ class RawRows(TiffSegments):
             part[:] = self._values(rows[:, col0 : col0 + part.shape[1]])
 
     def _stored_rows(self, row0: int, height: int) -> NDArray[np.generic]:
-        """(height, width, samples) stored numbers from a row on. Of a local file they are mapped: only the pages of the
-        columns that are then taken are read, and none of them is held afterwards."""
+        """(height, width, samples) stored numbers from a row on. Those of a local file are mapped: only the memory
+        pages of the columns that are used are read, and none is kept."""
         start = int(self._page.dataoffsets[0]) + row0 * self._row_bytes
         shape = (height, self.width_px, self._page.samplesperpixel)
         if self._address is not None:

@@ -182,6 +182,8 @@ def _scatter(off: Array, predicted: Array, targets: TargetPlaces, observed_px2: 
 def _p_values(fit: _Regression, targets: TargetPlaces) -> Array:
     """(n,) p-values of the deviations: F-distributed, since the scatter is estimated; scaled by the local scatter."""
     count = min(_NEIGHBOURS + 1, len(fit.squares))
+    if count < 2:  # a target without others
+        return np.ones(len(fit.squares))
     near = np.asarray(cKDTree(targets.places_px).query(targets.places_px, k=np.arange(2, count + 1))[1])
     local = np.median(fit.squares[near], axis=1) / _MEDIAN
     chance = np.ones(len(fit.squares))

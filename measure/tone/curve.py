@@ -255,7 +255,7 @@ class Tone:
         """Convert grey values to light on the same scale, 0 to full_scale; both ends are fixed."""
         if self.is_identity:
             return np.asarray(code, np.float32)
-        share = np.asarray(code, np.float32) * np.float32(_PIECES / full_scale)
+        share = np.maximum(np.asarray(code, np.float32) * np.float32(_PIECES / full_scale), np.float32(0.0))
         whole = np.minimum(share.astype(np.int32), _PIECES - 1)
         table, steps = self._float32_table
         return np.asarray(np.float32(full_scale) * (table[whole] + steps[whole] * (share - whole)), np.float32)

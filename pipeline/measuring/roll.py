@@ -162,9 +162,8 @@ def _together(frame: FrameMeasurement, turn: str, told: bool, frames: int) -> Sc
     )
     # Whether the scan is mirrored is known by the frame alone; the frame itself may be a false detection.
     is_face_known = abs(plain - mirrored) >= DECIDED
-    is_doubted = not any(mark.status == Status.MEASURED for mark in frame.marks) or any(
-        problem in frame.pose.evidence for problem in frame.problems
-    )
+    fiducials = [mark.status for mark in frame.marks if mark.kind == "fiducial"]
+    is_doubted = Status.MEASURED not in fiducials or any(problem in frame.pose.evidence for problem in frame.problems)
     if is_doubted or not is_face_known:
         like = f"named {pose.name} as the other frames of the camera, so that its writing lies as theirs."
         return replace(pose, evidence=(*pose.evidence, like)) if pose.name != frame.pose.name else pose

@@ -19,12 +19,22 @@ from adjust.display import contour_levels, distance_text
 from adjust.errors import DatumError
 from adjust.problem.camera import FiducialDistance
 from adjust.problem.network import Board, Scanner
-from adjust.problem.observations import Distance
+from adjust.problem.observations import Distance, Observations
 from adjust.problem.parameter import object_coordinate, parameter_from_text, parameters_from_texts
 from adjust.quality.critical_values import Probabilities, WeightFunction
 from adjust.solution.adjustment import Datum, Options
 
 Change = Callable[[Network], Network]
+
+
+def test_mirrored_observations_scatter_as_their_covariances_say() -> None:
+    """By the scatter of many places, mirrored one by one."""
+    rng, covariance, signs = np.random.default_rng(2), np.array([[4.0, 1.5], [1.5, 1.0]]), np.array([[-1.0, 1.0]])
+    places = rng.multivariate_normal([0.0, 0.0], covariance, 4000)
+    one = Observations(("a",), ("1",), ("target",), np.array([[3.0, 2.0]]), covariance[None])
+    mirrored = one.mirror(signs, np.array([[10.0, 0.0]]))
+    np.testing.assert_allclose(mirrored.covariance_mm2[0], np.cov((places * signs).T), atol=0.3)
+    np.testing.assert_allclose(mirrored.xy_mm, [[7.0, 2.0]])
 
 
 def drop_observations(network: Network, image: str, kind: str, left: int) -> Network:

@@ -53,6 +53,13 @@ def test_what_covers_a_dot_and_resembles_a_smaller_one_is_doubted() -> None:
     assert "0.85 times as large as the other marks" in result.marks[3].reason
 
 
+def test_one_mark_gives_no_frame_and_no_error() -> None:
+    alone = draw.lay_out([MarkShape(draw.RING_CROSS)], draw.CORNERS[:1])
+    result = draw.measure_grey(draw.frame_picture(alone, draw.pixel_from_camera("0")), alone)
+    assert [mark.status for mark in result.marks] == [Status.ABSENT]
+    assert result.problems
+
+
 @pytest.mark.parametrize(("mark", "is_coarse"), [(ring_cross(0.5, 0.1, 0.8, 0.1), True), (dot(0.4), False)])
 def test_a_scan_without_a_frame_says_if_its_pixels_are_large(mark: tuple[Part, ...], is_coarse: bool) -> None:
     """Lines of 0.1 mm at 50 µm a pixel are 2 px wide, a dot of 0.8 mm is 16 px wide."""

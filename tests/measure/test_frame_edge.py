@@ -227,6 +227,23 @@ def test_a_corner_moves_with_the_tone_curve_as_its_edges_say(gamma: float) -> No
     assert fit_mark(Tone(power(gamma))).tone is None
 
 
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+@pytest.mark.parametrize("border_dn", [10000.0, 0.0])
+def test_a_corners_contrast_in_the_file_does_not_depend_on_the_tone_curve(gamma: float, border_dn: float) -> None:
+    """A step of 14 of 255 grey values beside black is 1/600 of the light of white, at a power of 2.2."""
+    step_dn = 27000.0 if border_dn else 14 * 257.0
+    rows, cols = np.mgrid[:SIZE, :SIZE]
+    sharp = np.where((cols > CENTER[0]) & (rows > CENTER[1]), border_dn + step_dn, border_dn)
+    stored = gaussian_filter(sharp, 1.0) + np.random.default_rng(2).normal(0.0, 60.0, sharp.shape)
+    start = np.column_stack([PX_PER_MM * np.diag([1.0, -1.0]), CENTER])
+    scan = make_scan(np.clip(stored, 0.0, None)).replace_tone(Tone(power(gamma)))
+    fit = fit_frame_corner(scan, shapes.frame_corner((-10.0, 10.0), 5.0), start, 6.0, 1)
+    assert fit.converged
+    assert fit.stored_contrast_dn == pytest.approx(step_dn, rel=0.04)
+    light = 65535 * np.diff((np.array([border_dn, border_dn + step_dn]) / 65535) ** gamma)
+    assert fit.contrast_dn == pytest.approx(light[0], rel=0.04)
+
+
 LINES_PX_PER_MM, LINE_MM, SIZE_PX, BLUR_PX = 20.0, 0.2, 640, 0.9
 STEPS_MM = np.arange(-2, 3) * 5.0
 MIDDLE_PX, LINES_TURN = np.array([322.3, 317.8]), np.deg2rad(0.4)
@@ -379,6 +396,24 @@ def test_what_jpeg_does_to_edges_is_in_the_standard_deviations(quality: int, alo
             errors.append(whitened(corner.center_px - center, corner.covariance.px2))
     assert len(errors) >= 45
     assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.25  # 90 numbers: 7.5 % standard deviation
+
+
+def test_a_corner_of_a_part_is_known_as_well_as_in_the_whole_picture() -> None:
+    """JPEG's blocks begin where they do in the whole one."""
+    rng, center = np.random.default_rng(6), np.array([12.3, 12.8])
+    grey = square_picture(center, np.diag([16.0, 14.0]), 0.8, False) + rng.normal(0, 1.0, (CORNER_SIZE, CORNER_SIZE))
+    starts = [CornerStart(center, np.diag([16.0, 14.0]), np.array([6.0, 6.0]), np.zeros(2))]
+
+    def covariance(first: int, first_block_px: tuple[int, int]) -> Array:
+        def read(col: int, row: int, side: int) -> ScanWindow:
+            part = slice(first + row, first + row + side), slice(first + col, first + col + side)
+            return ScanWindow(grey[part], (col, row))
+
+        own = [replace(start, center_px=start.center_px - first) for start in starts]
+        return fit_corners(read, own, crossing, 40.0, first_block_px)[0].covariance.px2
+
+    np.testing.assert_allclose(covariance(3, (5, 5)), covariance(0, (0, 0)), rtol=1e-4)
+    assert not np.allclose(covariance(3, (0, 0)), covariance(0, (0, 0)), rtol=0.02)
 
 
 @pytest.mark.parametrize("blur_px", [0.5, 1.5])

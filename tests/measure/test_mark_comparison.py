@@ -192,6 +192,17 @@ def plain() -> Frame:
     return make_frame(np.random.default_rng(3), 1.0, 1.0)[0]
 
 
+@pytest.mark.parametrize(("axis", "is_inlier"), [((1.0, 1.0), True), ((1.0, -1.0), False)])
+def test_an_error_along_the_long_axis_of_its_ellipse_is_no_gross_error(
+    plain: Frame, axis: tuple[float, float], is_inlier: bool
+) -> None:
+    """All marks have an ellipse that leans to the right and down in the scan; one lies off along it, or across it."""
+    leaning = Covariance.from_noise(2.0**2 * np.full((2, 2), 0.5) + 0.05**2 * np.array([[0.5, -0.5], [-0.5, 0.5]]))
+    fits = {index: replace(fit, place_covariance=leaning) for index, fit in plain.inlier_fits.items()}
+    fits[4] = fits[4].shifted(np.sqrt(2.0) * np.array(axis))
+    assert orient_frame(plain.replace_fits(fits)).inliers.tolist() == [index != 4 or is_inlier for index in range(8)]
+
+
 KNOWN = Covariance.from_noise(0.2**2 * np.eye(2))
 
 

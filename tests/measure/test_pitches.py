@@ -298,16 +298,19 @@ def test_a_second_frame_is_named_with_the_windows_of_both(second: str | None, is
         else first[::-1, :1] * np.ones((1, draw.FRAME_PX))
     )
     options = FiducialOptions()
-    scan = draw.make_scan(np.vstack([other, first]))
+    both = np.vstack([other, first])
+    file = draw.make_scan(np.pad(both, ((21, 0), (13, 0)), mode="edge"))
+    scan = crop_scan(file, (13, 21, both.shape[1], both.shape[0]))  # the windows are those of the whole file
     window = (0, draw.FRAME_PX, draw.FRAME_PX, draw.FRAME_PX)
     frame = measure_fiducials(crop_scan(scan, window), draw.ALIKE, (draw.PITCH_UM, draw.PITCH_UM), options)
     result = second_frame(scan, draw.ALIKE, moved_frame(frame, np.array([0.0, draw.FRAME_PX])), options)
     assert bool(result) == is_named
     if is_named:
         windows = re.findall(r'"(\d+) (\d+) (\d+) (\d+)"', result)
-        (_, lower, _, _), (_, upper, _, height) = [tuple(map(int, window)) for window in windows]
-        assert lower == pytest.approx(draw.FRAME_PX + 27, abs=6)  # 17 mm about the middle, row 197.6
-        assert upper == pytest.approx(27, abs=6)
+        (left, lower, _, _), (_, upper, _, height) = [tuple(map(int, window)) for window in windows]
+        assert lower == pytest.approx(21 + draw.FRAME_PX + 27, abs=6)  # 17 mm about the middle, row 197.6
+        assert upper == pytest.approx(21 + 27, abs=6)
+        assert left == pytest.approx(13 + 30, abs=8)
         assert height == pytest.approx(343, abs=8)
 
 

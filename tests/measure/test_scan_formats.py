@@ -18,7 +18,7 @@ from damaged_files import HEIGHT, WIDTH, picture, whole
 from numpy.typing import NDArray
 
 from measure import MeasurementError, open_scan
-from measure.scans.opening import read_head
+from measure.scans.opening import crop_scan, declared_tone, read_head
 from measure.scans.parallel import map_in_threads
 
 
@@ -280,6 +280,17 @@ def test_the_orientation_tag_is_stated_and_not_applied(tmp_path: Path) -> None:
         assert "orientation tag (8) is not applied" in scan.notes[0]
 
 
+@pytest.mark.parametrize("stored", [(3, 2, (8, 6)), (5, 1, (8, 1)), (3, 1, 0), (2, 2, b"8\0")])
+def test_an_orientation_tag_that_is_none_counts_as_upright(stored: tuple[int, int, Any], tmp_path: Path) -> None:
+    """Two numbers, a fraction, a number that is none of the eight, and text."""
+    tifffile.imwrite(tmp_path / "s.tif", np.zeros((1, 1), np.uint8), extratags=[(274, *stored, True)])
+    PIL.Image.fromarray(picture(np.uint8)).save(
+        tmp_path / "s.jpg", exif=b"Exif\0\0" + (tmp_path / "s.tif").read_bytes()
+    )
+    with open_scan(tmp_path / "s.jpg") as scan:
+        assert (scan.orientation, scan.notes) == (1, ())
+
+
 def test_twelve_bits_have_their_own_full_scale(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "s.tif", picture() >> 4, bitspersample=12, photometric="miniswhite")
     with open_scan(tmp_path / "s.tif") as scan:
@@ -319,6 +330,7 @@ def test_lab_gives_its_lightness(tmp_path: Path, kind: str, dtype: type[np.unsig
     with open_scan(tmp_path / "s.tif") as scan:
         assert (scan.channels, scan.full_scale_dn) == (1, full)
         assert scan.notes == ("its colours are CIE L*a*b*: the lightness L* is used",)
+    assert read_head(tmp_path / "s.tif").bits == np.iinfo(dtype).bits
     np.testing.assert_array_equal(whole(tmp_path / "s.tif"), lightness)
 
 
@@ -399,6 +411,7 @@ def test_jpeg_2000_without_loss(tmp_path: Path, bits: int, channels: int, ending
     np.testing.assert_allclose(whole(path), luminance(truth), rtol=1e-5)
     head = read_head(path)
     assert (head.file_format, head.width_px, head.bits, head.channels) == ("JPEG 2000", WIDTH, bits, channels)
+    assert declared_tone(path) is None  # its colour box, if it has one, names sRGB
 
 
 def test_jpeg_2000_with_loss_says_so_and_its_resolution(tmp_path: Path) -> None:
@@ -446,10 +459,10 @@ def set_tag(path: Path, tag: int, value: Any) -> None:
             page.tags[tag].overwrite(value, dtype=kind)
 
 
-def zeros_png(side: int) -> bytes:
-    """Of a picture of 8 bits that holds nothing but zeros."""
+def zeros_png(side: int, bits: int = 8) -> bytes:
+    """Of a picture that holds nothing but zeros."""
     rows = zlib.compress(bytes(1000))
-    chunks = [(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)), (b"IDAT", rows), (b"IEND", b"")]
+    chunks = [(b"IHDR", struct.pack(">IIBBBBB", side, side, bits, 0, 0, 0, 0)), (b"IDAT", rows), (b"IEND", b"")]
     parts = [
         struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body)) for name, body in chunks
     ]
@@ -502,6 +515,12 @@ def test_a_damaged_tile_is_unknown_and_costs_none_of_the_others(tmp_path: Path, 
         assert "tile 7" in scan.damage
         assert "tile 7" in scan.loss_reason(120, 120, 10, 10)
         assert scan.loss_reason(0, 0, 64, 200) == ""
+        intact, cut = (crop_scan(scan, (*first, 64, 64)) for first in ((0, 0), (100, 80)))
+        assert not intact.damage
+        assert not intact.is_lost
+        assert "(rows 80 to 127, tile 7" in cut.damage
+        np.testing.assert_array_equal(cut.inside(-5, 0, 74, 64), np.pad(known[80:144, 100:164], ((0, 0), (5, 5))))
+        assert crop_scan(scan, (130, 70, 20, 20)).is_lost
     lost = np.zeros((HEIGHT, WIDTH), bool)
     lost[64:128, 128:192] = True
     np.testing.assert_array_equal(known, ~lost)
@@ -583,6 +602,20 @@ def test_a_picture_that_claims_more_than_its_file_can_hold(tmp_path: Path) -> No
     for name, size in (("s.jpg", "65000 x 65000"), ("s.tif", "1000000000 x 1000000000"), ("s.png", "40000 x 40000")):
         with pytest.raises(MeasurementError, match=rf"claims a picture of {size} pixels .*--max-pixels \d+"):
             open_scan(tmp_path / name)
+
+
+def test_a_head_is_refused_where_the_picture_is(tmp_path: Path) -> None:
+    """100 megapixels of 16 bits exceed the 128 MiB that are always allowed."""
+    (tmp_path / "s.png").write_bytes(zeros_png(10_000, 16))
+    (tmp_path / "s.jp2").write_bytes(imagecodecs.jpeg2k_encode(picture(np.uint16), codecformat="jp2"))
+    data = bytearray((tmp_path / "s.jp2").read_bytes())
+    at = data.index(b"\xff\x51") + 6
+    data[at : at + 8] = (10_000).to_bytes(4, "big") * 2
+    (tmp_path / "s.jp2").write_bytes(bytes(data[:5000]) + b"\xff\xd9")
+    for name in ("s.png", "s.jp2"):
+        for use in (read_head, open_scan):
+            with pytest.raises(MeasurementError, match=r"claims a picture of 10000 x 10000 pixels \(200000000 bytes"):
+                use(tmp_path / name)
 
 
 def test_a_strip_of_zstd_that_decodes_to_gigabytes(tmp_path: Path) -> None:

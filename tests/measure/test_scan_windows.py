@@ -20,7 +20,7 @@ from studies import parametrize_with_studies
 from measure import MeasurementError, Scan
 from measure.errors import MissingError, UnreachableError
 from measure.scans import jpeg, remote
-from measure.scans.opening import declared_tone, open_scan, read_head
+from measure.scans.opening import crop_scan, declared_tone, open_scan, read_head
 from measure.scans.parallel import map_in_threads, map_or_replace
 from measure.scans.remote import Address, scan_path
 from measure.targets.block_search import Octave, Patches, ScanBlock, search_blocks
@@ -164,9 +164,18 @@ def test_the_head_agrees_with_the_scan(name: str, picture: np.ndarray, tags: dic
     head = read_head(path)
     with open_scan(path) as scan:
         assert (head.width_px, head.height_px, head.channels) == (scan.width_px, scan.height_px, scan.channels)
-        assert 2**head.bits - 1 == scan.full_scale_dn
+        assert head.bits == (8 if picture.dtype == np.uint8 else 16)
         assert (head.pitch.um, head.pitch.note) == (scan.pitch_um, scan.pitch_note)
     assert head.file_format == {".tif": "TIFF", ".jpg": "JPEG", ".png": "PNG"}[path.suffix]
+
+
+def test_a_window_of_a_scan_keeps_its_weights_and_knows_its_place(tmp_path: Path) -> None:
+    with open_scan(written(tmp_path / "colour.tif", COLOUR, photometric="rgb")) as scan:
+        view = crop_scan(crop_scan(scan.green_channel(), (10, 7, 60, 40)), (5, 3, 20, 30))
+        np.testing.assert_array_equal(view.window(0, 0, 20, 30), COLOUR[10:40, 15:35, 1])
+        assert view.origin_px == (15, 10)
+        with pytest.raises(ValueError, match="cannot be reduced by 0"):
+            view.reduced(0)
 
 
 def test_no_picture_is_decoded_for_its_head(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

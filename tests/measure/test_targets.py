@@ -364,6 +364,13 @@ def test_wrong_ones_are_reported_and_right_ones_as_seldom_as_stated(count: int) 
     assert 0.01 < (right < 0.1).mean() < 0.12  # neighbours that scatter more make it less than said
 
 
+def test_a_target_without_others_is_not_doubted() -> None:
+    targets, view = target_places(np.random.default_rng(1), 1, np.zeros(1))
+    compared = compare_targets(targets, view + 50.0, 1e-6 * np.eye(2)[None], SIZE_PX)
+    assert compared.chance.tolist() == [1.0]
+    assert compared.off_px.shape == (1, 2)
+
+
 def test_points_known_less_well_may_lie_farther_off() -> None:
     rng = np.random.default_rng(5)
     sigma = np.where(np.arange(200) < 20, 1.0, 0.02)

@@ -266,6 +266,17 @@ def make_frames(figures: Sequence[Mapping[str, float]], doubt: Reason) -> list[F
     return frames
 
 
+def test_a_target_with_a_fiducials_name_has_no_part_in_its_comparison() -> None:
+    target = MarkMeasurement("1", "target", np.ones(2), Covariance({Cause.NOISE: np.eye(2)}), Status.MEASURED)
+    weak = replace(target, status=Status.WEAK, reason=unlike_blur(1.6), quality={"blur_ratio": 1.0, "blur_sigma": 0.01})
+    plain = make_frames([{"blur_ratio": 1.6}, {"size_ratio": 1.3}, {}, {}], unlike_blur(1.6))
+    for own in (target, weak):
+        frames = check_own_figures([replace(frame, marks=(*frame.marks, own)) for frame in plain])
+        assert [frame.marks[-1] for frame in frames] == [own] * len(frames)
+        statuses = [[mark.status for mark in frame.marks] for frame in check_own_figures(plain)]
+        assert [[mark.status for mark in frame.marks[:-1]] for frame in frames] == statuses
+
+
 @pytest.mark.parametrize(
     ("figures", "doubt", "status"),
     [

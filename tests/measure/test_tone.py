@@ -24,7 +24,7 @@ from measure.fiducials.mark_fit import Detection, detect_mark, options_for
 from measure.fiducials.measure_frame import Frame, measure_frame, shift_to_curve
 from measure.flags import Cause
 from measure.scans.jpeg import covariance_of_compression, rounding_step_dn
-from measure.scans.opening import declared_tone
+from measure.scans.opening import crop_scan, declared_tone
 from measure.tone.curve import LINEAR, Tone, ToneInformation, power, sampled_curve, srgb
 from measure.tone.declared import curve_of_profile
 from measure.tone.estimate import FrameTone, MarkTone, tone_score
@@ -83,10 +83,13 @@ def settled_from(
     (Tone(power(2.2)), FULL / 2, FULL * 0.5**2.2),
     (Tone(srgb()), 0.5 * FULL, FULL * 0.21404),  # IEC 61966-2-1
     (Tone(sampled_curve(np.linspace(0, 1, 9) ** 2)), FULL * 0.5, FULL * 0.25),
+    (Tone(power(2.2)), 0.0, 0.0),
 ])  # fmt: skip
 def test_light_of_a_code_and_back(tone: Tone, code: float, light: float) -> None:
     assert tone.light(np.array([code]), FULL)[0] == pytest.approx(light, rel=1e-3)
     assert tone.code(np.array([light]), FULL)[0] == pytest.approx(code, rel=1e-3)
+    if not tone.is_identity:
+        assert tone.light(np.array([-0.5]), FULL)[0] == 0.0
 
 
 def test_departures_change_light_as_their_derivatives_say() -> None:
@@ -303,11 +306,19 @@ SRGB = b"para" + bytes(4) + struct.pack(">HH", 3, 0) + struct.pack(
 def test_profiles_of_every_kind_of_curve(curve: bytes, expected: float, tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, GREY, iccprofile=profile(curve))
-    tone = declared_tone(path)
-    assert light(tone) == pytest.approx(expected, abs=0.003)
-    assert tone is not None
-    assert tone.is_declared
-    assert "ICC" in tone.source
+    data = imagecodecs.jpeg2k_encode(GREY, codecformat="jp2")
+    at, body = data.index(b"colr") - 4, b"colr\2\0\0" + profile(curve)  # a restricted profile for an enumerated colour
+    jp2h = data.index(b"jp2h") - 4
+    old, whole = (struct.unpack_from(">I", data, place)[0] for place in (at, jp2h))
+    head = struct.pack(">I", whole - old + len(body) + 4) + data[jp2h + 4 : at]
+    box = struct.pack(">I", len(body) + 4) + body
+    path.with_suffix(".jp2").write_bytes(data[:jp2h] + head + box + data[at + old :])
+    for each in (path, path.with_suffix(".jp2")):
+        tone = declared_tone(each)
+        assert light(tone) == pytest.approx(expected, abs=0.003)
+        assert tone is not None
+        assert tone.is_declared
+        assert "ICC" in tone.source
 
 
 def test_a_profile_of_another_program_agrees_with_its_own_curve(tmp_path: Path) -> None:
@@ -528,6 +539,9 @@ def test_a_file_without_loss_tells_that_its_picture_was_jpeg(quality: int, share
     cv2.imwrite(str(tmp_path / "again.jpg"), was, (cv2.IMWRITE_JPEG_QUALITY, 98))
     for name, unit in (("grey.tif", 1), ("deep.tif", 257), ("colour.png", 1), ("again.jpg", 1)):
         with measure.open_scan(tmp_path / name) as scan:
+            col, row = (0, 0) if name == "colour.png" else (3, 5)  # where blocks begin behind 5 columns and 3 rows
+            assert scan.first_block_px == (col, row)
+            assert crop_scan(scan, (10, 20, 300, 300)).first_block_px == ((col - 10) % 8, (row - 20) % 8)
             assert scan.rounding_step_dn == pytest.approx(unit * expected, rel=0.05)
             assert "was compressed as JPEG before" in scan.notes[-1]
 

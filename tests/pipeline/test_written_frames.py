@@ -134,6 +134,10 @@ def test_what_single_frames_do_not_tell_they_tell_together() -> None:
     assert {name: (p.name, p.decided) for name, p in together.items()} == {"a": ("0", True), "b": ("270m", True)}
     doubted = replace(scans[1], frame=replace(scans[1].frame, problems=(Reason("not told.", Code.CHANCE),)))
     assert not poses_of_roll([scans[0], doubted], WILD)["b"].decided
+    (mark,) = scans[1].frame.marks
+    weak = replace(mark, status=Status.WEAK, reason=Reason("it is blurred", Code.BLUR))
+    faint = replace(scans[1], frame=replace(scans[1].frame, marks=(weak, replace(mark, kind="target"))))
+    assert not poses_of_roll([scans[0], faint], WILD)["b"].decided  # a target says nothing of the frame
     stamp: Written = ("LIBRARY OF FILMS", "270", "right")
     scans = [posed(name, "0", (f"LIBRARY COPY {name}", *stamp[1:])) for name in "1234"]
     poses = poses_of_roll(scans, WILD)
