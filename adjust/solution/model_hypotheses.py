@@ -673,14 +673,7 @@ def _wrong_points(run: Run, most: int) -> Iterator[ModelHypothesis]:
 
     Coordinates that are given with a standard deviation are observations, tested by data snooping.
     """
-    network, unknowns = run.problem.network, run.problem.unknowns
-    images = Counter(name for name, _ in set(zip(network.observations.point, network.observations.image, strict=True)))
-    fixed = {
-        name: np.array([prior is not None and prior.sigma == 0.0 for prior in network.point_by_id[name].priors])
-        for name in unknowns.point
-        if images[name] >= FEWEST_IMAGES
-    }
-    fixed = {name: mask for name, mask in fixed.items() if mask.any()}
+    network, unknowns, fixed = run.problem.network, run.problem.unknowns, _fixed_coordinates(run)
     if len(fixed) < FEWEST_GIVEN:
         return
     positions = np.concatenate([unknowns.point[name][mask] for name, mask in fixed.items()])
@@ -689,13 +682,25 @@ def _wrong_points(run: Run, most: int) -> Iterator[ModelHypothesis]:
     for selection in displaced_points(run, axes, continued_with(run, positions), fixed, most):
         mask = np.array([fixed[name] for name in selection.names])
         added = np.array([unknowns.point[name] for name in selection.names])[mask]
-        words = _point_words(selection, mask, unknowns.given[added])
+        words = _point_words(selection, mask, unknowns.given[added], len(fixed))
         if selection.words:
             moved = _of_targets(run, dict.fromkeys(selection.names, np.eye(3)))
             found = displaced(run, "group", "point", words, moved)
         else:
             found = ModelHypothesis("point", words, continued_with(run, added), added)
         yield replace(found, selection=selection)
+
+
+def _fixed_coordinates(run: Run) -> dict[str, Mask]:
+    """Mask (3,) of the fixed coordinates of each point that has some, and that FEWEST_IMAGES show."""
+    network = run.problem.network
+    images = Counter(name for name, _ in set(zip(network.observations.point, network.observations.image, strict=True)))
+    fixed = {
+        name: np.array([prior is not None and prior.sigma == 0.0 for prior in network.point_by_id[name].priors])
+        for name in run.problem.unknowns.point
+        if images[name] >= FEWEST_IMAGES
+    }
+    return {name: mask for name, mask in fixed.items() if mask.any()}
 
 
 def wrong_points(earlier: ModelHypothesis | None, found: ModelHypothesis, run: Run) -> ModelHypothesis:
@@ -709,7 +714,7 @@ def wrong_points(earlier: ModelHypothesis | None, found: ModelHypothesis, run: R
     unknowns, cofactor, wrong = found.problem.unknowns, free_cofactor(run.end), list[tuple[str, Mask, Indices]]()
     for each in rounds:
         for name in each.selection.names:
-            mask = np.isin(each.problem.unknowns.point[name], each.added)
+            mask = np.isin(each.problem.unknowns.point[name], each.added if each.shown is None else each.shown)
             at = unknowns.point[name][mask]
             off = run.end.state.values[at] - unknowns.given[at]
             if chdtrc(len(at), off @ np.linalg.solve(cofactor.part(at), off)) < LEVEL:
@@ -718,12 +723,15 @@ def wrong_points(earlier: ModelHypothesis | None, found: ModelHypothesis, run: R
         return found
     names, masks, positions = zip(*wrong, strict=True)
     added, selection = np.concatenate(positions), replace(found.selection, names=names)
-    words = _point_words(selection, np.array(masks), unknowns.given[added])
+    words = _point_words(selection, np.array(masks), unknowns.given[added], len(_fixed_coordinates(run)))
     return replace(found, words=words, shown=added, selection=selection)
 
 
-def _point_words(selection: Selection, fixed: Mask, given: Array) -> Words:
-    """Words on points whose fixed coordinates (k, 3) are not those given (n,), or on a group with one shift."""
+def _point_words(selection: Selection, fixed: Mask, given: Array, count: int) -> Words:
+    """Words on points whose fixed coordinates (k, 3) are not those given (n,), or on a group with one shift.
+
+    count: of the points with fixed coordinates.
+    """
     names, remedy = selection.names, "Correct the coordinates of these points, or their numbers among the marks."
 
     def words(found: Estimate) -> tuple[str, str]:
@@ -750,6 +758,12 @@ def _point_words(selection: Selection, fixed: Mask, given: Array) -> Words:
                 f"{len(names)} points are not where they are given: {some}; all are off by the same shift, "
                 f"{_axes_words(*common)} (points' unit)",
                 remedy,
+            )
+        if 2 * len(names) > count:
+            return (
+                f"{len(names)} of {count} points that are given as exact are not where they are given, by "
+                f"{np.sqrt(np.mean(offs[fixed] ** 2)):.2g} rms (points' unit): their coordinates are not exact",
+                "Give sX, sY and sZ as the points have them.",
             )
         worst = np.argsort(-np.linalg.norm(offs, axis=1), kind="stable")[:NAMED]
         return (

@@ -244,6 +244,18 @@ def test_a_film_that_did_not_converge_has_no_marks_outside_the_picture() -> None
     assert outside == [True, False]
 
 
+def test_points_that_are_given_as_exact_and_are_not_are_not_named_one_by_one() -> None:
+    rng = np.random.default_rng(3)
+    made, start = nets.simulated(rng, points=nets.field_points(rng, 24), fiducial_sigma=0.005)
+    given = nets.map_priors(
+        made, lambda name, prior: replace(prior, value=prior.value + 2.0 * rng.normal() * name.startswith("PT."))
+    )
+    (found,) = adjust_problem(number_reduced(given, start)[0], Options()).explanations
+    count, rms = re.findall(r"^(\d+) of 24 points that are given as exact are not .* by (\S+) rms", found.cause)[0]
+    assert int(count) > 12
+    assert float(rms) == pytest.approx(2.0, rel=0.25)
+
+
 def test_a_boards_corner_that_is_bent_up_is_named_by_its_points() -> None:
     """It was taken for a bend and a twist of the whole board."""
     made = faults.scene(8, flat=True)
