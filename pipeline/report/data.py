@@ -129,13 +129,19 @@ class ReportData:
         stored = self.adjustment
         if stored is None or any(camera.fiducials for camera in stored.cameras.values()):
             return {}
-        sizes: dict[str, set[float]] = {name: set() for name in stored.cameras}
+        sizes = defaultdict[str, set[float]](set)  # of cameras with images
         for name, image in stored.images.items():
             is_film = image.transformation.kind != "none"
             sizes[stored.image_camera(name)] |= {math.nan} if is_film else {*self.pitch_um.get(name, (math.nan,))}
         if any(len(each) != 1 or math.isnan(min(each)) for each in sizes.values()):
             return {}
         return {name: ImageUnit(min(each)) for name, each in sizes.items()}
+
+    @property
+    def common_unit(self) -> ImageUnit:
+        """Unit of image lengths of all cameras together: pixels only where all have those of one size."""
+        units = {*self.image_units.values()}
+        return units.pop() if len(units) == 1 else FILM_UNIT
 
     @cached_property
     def residuals_by_image(self) -> Mapping[str, list[ResidualRecord]]:

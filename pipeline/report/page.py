@@ -25,7 +25,6 @@ from pipeline.report.numbers import fixed, fixed_list, significant, value_and_si
 from pipeline.report.parameters import axes_sentence, group_sentences, spoken_name
 from pipeline.report.verdict import A_PRIORI, contradiction, critical_w, judge, lens_sentences, sigma0_bounds
 from pipeline.results.adjustment_record import AdjustmentRecord, PointRecord
-from pipeline.results.image_unit import FILM_UNIT
 from pipeline.text.files import write_atomically
 
 LIST_LIMIT = 200  # rows of a long table
@@ -131,7 +130,8 @@ def _common(data: ReportData) -> dict[str, object]:
         "version": version("reseau"),
         "made_from": ", ".join(f"{name} {fingerprint}" for name, fingerprint in data.made_from.items()) or "memory",
         "unit": data.unit,
-        "group_unit": next(iter(data.image_units.values()), FILM_UNIT),
+        "group_unit": data.common_unit,
+        "is_in_pixels": bool(data.image_units),
         "adjustment": data.adjustment,
         "critical_w": critical_w(2 * len(data.adjustment.residuals)) if data.adjustment else 0.0,
         "has_pictures": data.thumbnail is not None,
@@ -148,7 +148,7 @@ def _frame_context(data: ReportData, shots: list[ReportedFrame], every_mark: boo
     points_word = "targets"
     if "tie" in kinds:
         points_word = "targets and tie points" if "target" in kinds else "tie points"
-    px_per_unit = arrow_scale(shots) / next(iter(data.image_units.values()), FILM_UNIT).per_um
+    px_per_unit = arrow_scale(shots) / data.common_unit.per_um
     arrow = svg.round_step(40.0 / px_per_unit)
     return {
         "frames": views,

@@ -113,6 +113,30 @@ def test_no_section_and_no_column_is_empty(adjusted_data: ReportData) -> None:
             assert all(any(cell.strip(" –") for cell in column) for column in zip(*cells, strict=False)), table
 
 
+def test_cameras_of_different_pixels_are_summed_up_in_micrometres() -> None:
+    """A residual of 2 um is 0.1 px of 20 um and 0.4 px of 5 um. A camera without images has no part in it."""
+    data = made_up_calibration.digital()
+    stored = present(data.adjustment)
+    (first,) = stored.cameras.values()
+    idle = replace(data, adjustment=replace(stored, cameras={**stored.cameras, "idle": first}))
+    assert idle.image_units == data.image_units
+    assert idle.common_unit.pixel_um == made_up_calibration.PITCH_UM
+    images = {
+        name: replace(image, camera="other" if name == "f1" else "RC 20") for name, image in stored.images.items()
+    }
+    cameras = {"other": first, **stored.cameras}
+    two = replace(data, adjustment=replace(stored, cameras=cameras, images=images))
+    two = replace(two, pitch_um={**data.pitch_um, "f1": (5.0, 5.0)})
+    assert {name: unit.pixel_um for name, unit in two.image_units.items()} == {
+        "other": 5.0,
+        "RC 20": made_up_calibration.PITCH_UM,
+    }
+    assert not two.common_unit.is_pixel
+    assert "rms x (px)" in rendered(two).text
+    rms = present(two.adjustment).groups["target"].rms_x_um
+    assert f"rms of targets {rms:.1f} ×" in rendered(two).text
+
+
 def test_a_digital_camera_is_reported_in_pixels_without_film() -> None:
     """c = 153.664 mm at 20 µm is 7683.2 px, its standard deviation 0.0041 mm 0.21 px. mm⁻² is the family's own."""
     document = Document(page_of("digital"))
