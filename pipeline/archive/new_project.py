@@ -19,7 +19,7 @@ from pipeline.files.camera_file import read_camera
 from pipeline.files.library import PREFIX, library_path, read_library
 from pipeline.progress import Reporter
 from pipeline.text.csv_table import csv_line
-from pipeline.text.files import check_writable, image_name, names_below, write_atomically
+from pipeline.text.files import check_writable, image_name, names_below, split_lines, write_atomically
 from pipeline.text.wording import count_sentence, counted, listed, quoted
 from pipeline.workers import worker_pool
 
@@ -218,7 +218,8 @@ def _given_paths(given: Path) -> list[Path]:
     """The path itself, or the entries of a list file: one path or address per line."""
     if isinstance(given, Address) or given.suffix.lower() != ".txt" or not given.is_file():
         return [given]
-    lines = [line.strip() for line in given.read_text(encoding="utf-8-sig", errors="surrogateescape").splitlines()]
+    text = given.read_text(encoding="utf-8-sig", errors="surrogateescape")
+    lines = [line.strip() for line in split_lines(text)]
     named = [line for line in lines if line and not line.startswith("#")]
     return [scan_path(line) if is_address(line) else given.parent / line for line in named]
 

@@ -17,7 +17,7 @@ from adjust.problem.observations import Distance
 from measure.scans.remote import Window
 from pipeline.errors import InputError
 from pipeline.text.csv_table import Row, read_csv
-from pipeline.text.files import FilePath, image_name, read_bytes, write_atomically
+from pipeline.text.files import FilePath, image_name, read_bytes, split_lines, write_atomically
 
 REQUIRED = ("point", "X", "Y", "Z")
 OPTIONAL = ("sX", "sY", "sZ", "nX", "nY", "nZ")
@@ -213,7 +213,7 @@ def fill_images(path: Path, values: Mapping[str, Mapping[str, str]]) -> None:
     """Fill empty cells of images.csv with values by image and column; everything else stays unchanged. Raises
     InputError where the file cannot be read or written."""
     text = read_bytes(path).decode("utf-8")
-    lines = text.splitlines(keepends=True)
+    lines = split_lines(text)
     header: list[str] = []
     for index, line in enumerate(lines):
         if not line.strip() or line.lstrip("\ufeff ").startswith("#"):

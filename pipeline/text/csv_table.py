@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import InputError
-from pipeline.text.files import LARGEST, SMALLEST_SIGMA, FilePath, no_such_file, quote_value, read_bytes
+from pipeline.text.files import LARGEST, SMALLEST_SIGMA, FilePath, no_such_file, quote_value, read_bytes, split_lines
 from pipeline.text.wording import did_you_mean
 
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
@@ -82,7 +82,7 @@ def csv_line(cells: Sequence[str]) -> str:
     written = []
     for cell in cells:
         text = f"'{cell}" if _FORMULA.match(cell) and not _NO_FORMULA.fullmatch(cell) else cell
-        needs_quotes = text.startswith("#") or any(letter in text for letter in ',"\n')
+        needs_quotes = text.startswith("#") or any(letter in text for letter in ',"\r\n')
         written.append('"' + text.replace('"', '""') + '"' if needs_quotes else text)
     return ",".join(written)
 
@@ -92,7 +92,7 @@ def read_csv(path: FilePath, required: Sequence[str], optional: Sequence[str] = 
     line."""
     path = Path(path)
     try:
-        lines = enumerate(read_bytes(path).decode("utf-8-sig").splitlines(), 1)
+        lines = enumerate(split_lines(read_bytes(path).decode("utf-8-sig")), 1)
     except FileNotFoundError:
         raise InputError(no_such_file(path)) from None
     except IsADirectoryError:

@@ -3,6 +3,7 @@ paths below a folder."""
 
 import json
 import os
+import re
 import stat
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
@@ -20,6 +21,11 @@ LARGEST = 1e15  # limit of coordinates, sizes and standard deviations, any unit:
 FilePath = str | os.PathLike[str]
 SMALLEST_SIGMA = 1e-9  # limit of standard deviations, mm, m or degrees: weights of smaller ones dominate all others
 FINEST_PITCH_UM = 0.1  # µm; no scanner or sensor has smaller pixels, so that mm or m must have been meant
+
+
+def split_lines(text: str) -> list[str]:
+    """Split text at line ends, which are kept. `str.splitlines` also splits at U+2028, which names may have."""
+    return re.findall(r"[^\r\n]*(?:\r\n?|\n)|[^\r\n]+", text)
 
 
 def read_bytes(path: Path, most_mb: int = MOST_MB) -> bytes:

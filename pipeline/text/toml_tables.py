@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import InputError
-from pipeline.text.files import SCAN_ENDINGS, FilePath, no_such_file, read_bytes
+from pipeline.text.files import SCAN_ENDINGS, FilePath, no_such_file, read_bytes, split_lines
 from pipeline.text.wording import did_you_mean
 
 MOST_MB = 4  # size of a camera file with marks learned from 12,000 scans
@@ -73,7 +73,7 @@ def _mending(text: str, error: str) -> str:
     if re.search("Unescaped|hex value", error):
         return "Mend that line (a path has / in the place of \\)."
     place = re.search(r"at line (\d+)", error)
-    line = text.splitlines()[int(place[1]) - 1] if place else ""
+    line = split_lines(text)[int(place[1]) - 1] if place else ""
     found = _BARE.match(line)
     if re.search("[“”„’]", line):
         return 'Quotes are straight here: "...".'
@@ -128,7 +128,7 @@ class Table:
     def _line_number(self, key: str) -> int | None:
         """Line of the key or sub-table of that name in this table; line of this table if it is missing."""
         try:
-            lines = self.file.read_text(encoding="utf-8-sig").splitlines()
+            lines = split_lines(self.file.read_text(encoding="utf-8-sig"))
         except (OSError, UnicodeDecodeError):
             return None
         name, _, count = self.place.partition("[")

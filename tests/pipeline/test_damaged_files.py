@@ -20,6 +20,7 @@ from projects import Capture, Refusal, command, copied, replace_text, write_netw
 from studies import parametrize_with_studies
 
 from pipeline.text.csv_table import csv_line, read_csv
+from pipeline.text.files import split_lines
 
 FILES = ("project.toml", "camera.toml", "points.csv", "images.csv", "distances.csv", "comparator.csv",
          "earlier/adjustment.json", "earlier/adjustment.npz")  # fmt: skip
@@ -195,18 +196,24 @@ def test_advice(sound: Path, refusal: Refusal, monkeypatch: pytest.MonkeyPatch, 
     assert ("Make room" in message) == (error == errno.ENOSPC)
 
 
+def test_lines_end_where_editors_end_them_alone() -> None:
+    assert split_lines("a\r\nb\n\nc\u2028d\re") == ["a\r\n", "b\n", "\n", "c\u2028d\r", "e"]
+    assert split_lines("") == []
+    assert csv_line(["a\rb", "1"]) == '"a\rb",1'
+
+
 @pytest.mark.parametrize(
     ("cell", "written"),
     [
         ("=1+1", "'=1+1"), ("+A1", "'+A1"), ("@SUM(1)", "'@SUM(1)"), ("-2+3", "'-2+3"), ("'=x", "''=x"),
         ("-12", "-12"), ("+3.5e-7", "+3.5e-7"), ("-", "-"), ("12-3", "12-3"), ("a=b", "a=b"), ("'tis", "'tis"),
-        ("#1", '"#1"'), ('=HYPERLINK("a,b")', "\"'=HYPERLINK(\"\"a,b\"\")\""),
+        ("a\u2028b", "a\u2028b"), ("#1", '"#1"'), ('=HYPERLINK("a,b")', "\"'=HYPERLINK(\"\"a,b\"\")\""),
     ],
 )  # fmt: skip
 def test_what_a_spreadsheet_would_run_is_written_as_text(cell: str, written: str, tmp_path: Path) -> None:
     assert csv_line([cell, "1"]) == f"{written},1"
     path = tmp_path / "table.csv"
-    path.write_text(f"name,value\n{csv_line([cell, '1'])}\n")
+    path.write_text(f"name,value\r\n{csv_line([cell, '1'])}\r\n", encoding="utf-8", newline="")
     assert next(read_csv(path, ("name", "value"))).name("name") == cell
 
 
