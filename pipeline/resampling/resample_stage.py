@@ -428,9 +428,7 @@ def _resampled(task: ResampleTask) -> Resampled:
         task.target.parent.mkdir(parents=True, exist_ok=True)
         parts = []
         for scan, chain in scans:
-            row_of_tiles = np.array([(0, 0), (canvas.width_px, 0), (0, -TILE_PX), (canvas.width_px, -TILE_PX)])
-            pixels, _ = chain.scan_from_frame(row_of_tiles * task.pitch_mm)
-            rows = int(np.ptp(pixels[:, 1])) + 2 * MARGIN_PX
+            rows = _tile_row_height_px(chain, canvas, scan.height_px) + 2 * MARGIN_PX
             source = opened.enter_context(open_source(scan, rows, task.target.parent))
             parts.append(OpenPart(source, chain, _smoothing_px(chain, canvas)))
         parts = find_inner_edges(parts)
@@ -445,6 +443,13 @@ def _resampled(task: ResampleTask) -> Resampled:
         source = parts[0].source
         clamped = write_frame(task.target, canvas, described, source.channels, source.dtype, make_tile)
     return replace(done, clamped=clamped)
+
+
+def _tile_row_height_px(chain: frame_canvas.FrameChain, canvas: frame_canvas.Canvas, height_px: int) -> int:
+    """Rows of a scan that the first row of tiles needs; all `height_px` where a corner of it has no place there."""
+    corners = np.array([(0, 0), (canvas.width_px, 0), (0, TILE_PX), (canvas.width_px, TILE_PX)], dtype=np.float64)
+    pixels, found = chain.scan_from_frame(canvas.camera_from_pixel(corners))
+    return min(int(np.ptp(pixels[:, 1])), height_px) if found.all() and np.isfinite(pixels).all() else height_px
 
 
 def _smoothing_px(chain: frame_canvas.FrameChain, canvas: frame_canvas.Canvas) -> float:

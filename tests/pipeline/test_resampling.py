@@ -20,12 +20,14 @@ from adjust.functional_model.transformation import Film
 from measure import MeasurementError, ScanOrientation, open_scan
 from measure.flags import Code, Reason
 from pipeline.files.project_file import read_project
-from pipeline.resampling.canvas import FrameChain, outline_canvas, scan_places
+from pipeline.resampling.canvas import Canvas, FrameChain, outline_canvas, scan_places
 from pipeline.resampling.resample_stage import (
     BEST,
     FAST,
+    TILE_PX,
     FrameScan,
     ResampleTask,
+    _tile_row_height_px,
     open_source,
     resample_tasks,
     resampled,
@@ -186,6 +188,20 @@ def test_a_lens_is_taken_out_as_opencv_has_it(scan: Path, tmp_path: Path) -> Non
     inside = (col > 8) & (col < WIDTH - 8) & (row > 8) & (row < HEIGHT - 8)
     assert inside.sum() > 0.8 * WIDTH * HEIGHT
     assert np.abs(pixels[inside] - light(col[inside], row[inside])).max() < 20.0
+
+
+def test_the_rows_that_a_row_of_tiles_needs_are_those_of_its_own_place() -> None:
+    """A barrel lens stretches what lies far from its axis; the ideal picture begins at its upper left corner."""
+    lens = Lens(Distortion("torlegard"), np.array([60.0, 0.0, 0.0]), np.array([4e-5, *[0.0] * 6]))
+    chain = FrameChain((10.0, 10.0), Film("none", np.empty(0), np.zeros(2)), lens=lens)
+    canvas = Canvas(-25.0, 25.0, 0.01, 5001, 5001)
+    corners_mm = np.array([(x, y) for x in (-25.0, 25.01) for y in (25.0, 25.0 - 0.01 * TILE_PX)])
+    observed_mm, _ = lens.camera_from_ray(corners_mm / 60.0)
+    expected = np.ptp(observed_mm[:, 1]) / 0.01
+    assert abs(_tile_row_height_px(chain, canvas, 10000) - expected) < 1.0
+    assert _tile_row_height_px(chain, canvas, 100) == 100
+    beyond = replace(canvas, x_mm=-1e9)
+    assert _tile_row_height_px(replace(chain, lens=replace(lens, parameters=-lens.parameters)), beyond, 777) == 777
 
 
 def test_a_missing_value_of_the_film_is_named() -> None:
