@@ -89,16 +89,17 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
             if judging is not None:
                 judging.check()
             for *row, is_whole in store.connection.execute(_QUERY, (-1 if judging is None else judging.row,)):
+                uri, *_, request, _ = row
                 if not is_whole:  # a damaged row counts as a failure
-                    row[6:] = [str(Verdict.FAILED), _DAMAGED, str(FailureCode.DAMAGED), None, "", row[11], None]
-                rows[row[0]] = row
+                    row[_VERDICT:] = [str(Verdict.FAILED), _DAMAGED, str(FailureCode.DAMAGED), None, "", request, None]
+                rows[uri] = row
             idle = inapplicable(judging)
     files, scans = FileStates(project.path.resolve().parent), []
     request_hash, decisions = request_hasher(project), group_decisions(project.decisions)
     for name, file in as_named(project.scans).items():
         state, camera = files.get(file), project.image_camera(name).path.name
         found = rows.get(state.uri)
-        if found is None or found[6] is None:
+        if found is None or found[_VERDICT] is None:
             scans.append(ScanStatus(name, state.uri, camera, Verdict.WAITING))
             continue
         *earlier, content, is_current, verdict, why, failure, seconds, finished, request, taken_in = found
@@ -115,6 +116,7 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
     return ArchiveStatus(tuple(sorted(scans)), tuple(dict.fromkeys((*unknown, *idle))))
 
 
+_VERDICT = 6  # its column in the query
 _QUERY = f"""
 select uri, bytes, mtime_ns, etag, content_hash, is_current,
     coalesce(f.verdict, result.verdict), coalesce(f.why, result.why),

@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import numpy as np
 
@@ -52,7 +52,7 @@ class BoardOptions:
 
     def __post_init__(self) -> None:
         """Raise InputError where an option of its kind is missing, before anything is read."""
-        assert self.table
+        _ = self.table
 
     @property
     def table(self) -> str:
@@ -129,8 +129,7 @@ def board_options(
     found = BoardOptions(kinds[kind], columns, rows, spacing_mm, size_mm, dictionary, legacy, first_id)
     table = TARGET_TABLES[kind](**tomllib.loads(found.table)["targets"])
     try:
-        assert isinstance(table, BoardTable)
-        assert table.board
+        _ = cast(BoardTable, table).board
     except ValueError as error:
         raise InputError(f"--kind {kind} --board {board}: {error}.") from None
     return found

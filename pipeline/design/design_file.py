@@ -1,6 +1,7 @@
 """design.json: expected precision and reliability, improvements, and sweeps."""
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -45,6 +46,7 @@ class Design:
         expected, plan = self.expected, self.expected.plan
         network, adjustment = expected.network, plan.adjustment
         kinds, pictures = network.observations.kind, list(self.files.values())[1:]
+        counts = Counter(zip(network.observations.image, kinds, strict=True))
         point_summary = {}
         for axis, sigmas in zip("XYZ", expected.point_sigmas.T, strict=True):
             estimated = sigmas[(sigmas > 0.0) & np.isfinite(sigmas)]
@@ -75,7 +77,7 @@ class Design:
                 for each in network.scanners
             },
             "photographs_alone": {parameter.text: sigma for parameter, sigma in self.alone.items()},
-            "images": {image.name: _image(expected, image) for image in network.images},
+            "images": {image.name: _image(expected, image, counts) for image in network.images},
             "points": dict(_points(expected)),
             "point_summary": point_summary,
             "distances": [
@@ -121,14 +123,13 @@ def _camera(expected: Expected) -> Content:
     }
 
 
-def _image(expected: Expected, image: Image) -> Content:
-    observations = expected.network.observations
-    kinds = [kind for name, kind in zip(observations.image, observations.kind, strict=True) if name == image.name]
+def _image(expected: Expected, image: Image, counts: Mapping[tuple[str, str], int]) -> Content:
+    """Image; counts: of observations by image and kind."""
     film = {name: Parameter.film(image.name, name) for name in film_parameter_names(image.transformation)}
     exterior = {name: Parameter.exterior(image.name, name) for name in EXTERIOR_NAMES}
     return {
-        "targets": kinds.count("target"),
-        "fiducials": kinds.count("fiducial"),
+        "targets": counts[image.name, "target"],
+        "fiducials": counts[image.name, "fiducial"],
         "transformation": {"kind": image.transformation, **_degree_quantities(expected, film)},
         "exterior": _degree_quantities(expected, exterior),
     }
@@ -145,10 +146,10 @@ def _degree_quantities(expected: Expected, parameters: Mapping[str, Parameter]) 
 def _points(expected: Expected) -> Iterator[tuple[str, Content]]:
     observations = expected.network.observations
     pairs = zip(observations.point, observations.kind, strict=True)
-    observed = [point for point, kind in pairs if kind == "target"]
+    observed = Counter(point for point, kind in pairs if kind == "target")
     for point in expected.network.points:
         axes = {axis: _quantity(expected, Parameter.point(point.id, axis)) for axis in "XYZ"}
-        yield point.id, {**axes, "images": observed.count(point.id)}
+        yield point.id, {**axes, "images": observed[point.id]}
 
 
 def _reliability(expected: Expected) -> Content:

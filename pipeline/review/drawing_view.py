@@ -411,18 +411,24 @@ def add_vertex(mark: MarkJson, place_mm: Array) -> MarkJson:
 def remove_part(mark: MarkJson, key: str) -> MarkJson:
     """Remove the vertex or the part named by a handle's key."""
     name, *rest = key.split(".")
-    if name not in ("vertices_mm", "part"):
+    if name not in ("vertices_mm", "part") or not rest:
         raise InputError("only corners of a polygon and parts can be taken out.")
-    at = int(rest[0])
-    part = mark[name][at]
-    if rest[1:2] == ["vertices_mm"] and len(part["vertices_mm"]) > 3:
-        part = {**part, "vertices_mm": _remove_item(part["vertices_mm"], int(rest[2]))}
-        return {**mark, name: [*mark[name][:at], part, *mark[name][at + 1 :]]}
-    return {**mark, name: _remove_item(mark[name], at)}
+    try:
+        at = int(rest[0])
+        part = mark[name][at]
+        if rest[1:2] == ["vertices_mm"] and len(part["vertices_mm"]) > 3:
+            part = {**part, "vertices_mm": _remove_item(part["vertices_mm"], int(rest[2]))}
+            return {**mark, name: [*mark[name][:at], part, *mark[name][at + 1 :]]}
+        return {**mark, name: _remove_item(mark[name], at)}
+    except (LookupError, ValueError):
+        raise InputError(f"the drawing has no {key!r} to take out.") from None
 
 
 def _remove_item(values: list[Any], at: int) -> list[Any]:
-    return [*values[:at], *values[at + 1 :]]
+    """Values without one. Raises IndexError where there is none at this place."""
+    rest = [*values]
+    del rest[at]
+    return rest
 
 
 def _unit(angle_deg: float) -> Array:

@@ -319,7 +319,8 @@ def _static(name: str) -> Callable[[Request], Response]:
 def _answering(answer: Callable[..., Any]) -> Callable[[Request], Any]:
     """Handler of requests. answer: returns JSON or PNG from the query and, of a POST request, the body.
 
-    Errors of the user become messages; others are faults of the program.
+    Errors of the user become messages, among them TypeError and ValueError, with which records and marks refuse values
+    of requests; others are faults of the program.
     """
 
     async def answering(request: Request) -> Response:

@@ -98,6 +98,12 @@ def test_sizes_are_dragged_and_corners_come_and_go() -> None:
     assert remove_part(more, "vertices_mm.1") == mark
     parts = {"kind": "parts", "part": [{"shape": "disk", "center_mm": [0, 0], "radius_mm": 1.0}] * 2}
     assert len(remove_part(parts, "part.0.radius_mm")["part"]) == 1
+    for key in ("part", "part.x", "part.7", "vertices_mm.0", "part.7.vertices_mm"):
+        with pytest.raises(InputError, match=r"taken out|to take out"):
+            remove_part(parts, key)
+    for key in ("vertices_mm", "vertices_mm.9", "radius_mm.0"):
+        with pytest.raises(InputError, match=r"taken out|to take out"):
+            remove_part(more, key)
 
 
 def test_given_coordinates_or_the_size_of_the_frame_tell_the_pitch() -> None:
