@@ -69,6 +69,9 @@ class CameraPlots:
                 style: dict[str, Any] = {"color": color, "label": label, "width": 0.0025}
                 style |= {"angles": "xy", "scale_units": "xy", "scale": to_vector}
                 quiver = axes.quiver(*places[rows].T, *vectors[rows].T, **style)
+        if not len(sizes):
+            axes.set_title(f"{self.name}: no residuals", loc="left", fontsize=10)
+            return axes
         key = _round_below(longest)
         axes.quiverkey(quiver, 0.95, -0.1, key, f"{key:g} {self._short_unit}", labelpos="W")
         if self.is_fiducial.any():

@@ -287,6 +287,12 @@ def test_of_film_both_kinds_of_marks_are_shown_in_the_camera_frame(film: Adjustm
     assert axes.get_xlabel() == "x' (mm)"
 
 
+def test_a_camera_without_observations_has_no_residuals(film: Adjustment) -> None:
+    plots, none = film.plots(), np.zeros((0, 2))
+    axes = replace(plots, places_mm=none, vectors_mm=none, is_fiducial=plots.is_fiducial[:0]).plot_residuals()
+    assert axes.get_title(loc="left") == "K: no residuals"
+
+
 def test_the_distortion_is_the_polynomial_of_the_parameters(film: Adjustment) -> None:
     axes = film.plot_distortion()
     radius, um = np.array(axes.lines[0].get_data())
