@@ -183,12 +183,18 @@ def _calibrated(
                 not_calibrated[camera.name] = str(error)
     if not adjustments:
         raise InputError(_nothing(pictures, left_out, not_calibrated))
-    calibrated = tuple(camera for camera in pictures.cameras if camera.name in adjustments)
-    project = write_project(out, replace(pictures, cameras=calibrated), options, lenses)
+    calibrated, names = pictures.select(adjustments)
+    project = write_project(out, calibrated, options, lenses)
+    if any(name != earlier for earlier, name in names.items()):  # the cameras left out had folders of their own
+        left_out = {names[image]: why for image, why in left_out.items() if image in names}
+        marks = [replace(mark, image=names[mark.image]) for mark in marks if mark.image in names]
+        for camera in calibrated.cameras:
+            own = [mark for mark in marks if mark.image in camera.images and mark.image not in left_out]
+            adjustments[camera.name] = adjust_marks(project, own)
     summary = run_all(project, reporter, work)
     checks = read_check(project.check_path).cameras if project.check_path.exists() else {}
     found = []
-    for each in calibrated:
+    for each in calibrated.cameras:
         adjustment, choice = adjustments[each.name], choices[each.name]
         reasons = {**left_out, **adjustment.left_out}
         own_reasons = {name: why for name, why in reasons.items() if name in each.images}

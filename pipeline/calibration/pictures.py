@@ -19,7 +19,7 @@ from adjust.solution.result import Adjustment
 from measure.errors import MeasurementError
 from measure.scans.jpeg import jpeg_colour_tags
 from measure.scans.metadata import DECODING_ERRORS, exif_number
-from measure.scans.opening import read_head
+from measure.scans.opening import ScanHead, read_head
 from pipeline.adjusting.adjust_stage import adjustment_options
 from pipeline.adjusting.network import build_network
 from pipeline.errors import InputError
@@ -65,6 +65,22 @@ class BoardPictureFiles:
     cameras: tuple[CameraPictures, ...]
     unreadable: Mapping[str, str]
 
+    def select(self, cameras: Collection[str]) -> tuple["BoardPictureFiles", dict[str, str]]:
+        """The images of some cameras, named below the folder that they share, and {earlier name: name}."""
+        own = [camera for camera in self.cameras if camera.name in cameras]
+        earlier = [image for camera in own for image in camera.images]
+        names = dict(zip(earlier, names_below([self.files[image] for image in earlier]), strict=True))
+        renamed = tuple(
+            replace(
+                camera,
+                images=tuple(names[image] for image in camera.images),
+                turned_deg={names[image]: turned for image, turned in camera.turned_deg.items()},
+                unsure_turns=tuple(names[image] for image in camera.unsure_turns),
+            )
+            for camera in own
+        )
+        return replace(self, files={names[image]: self.files[image] for image in earlier}, cameras=renamed), names
+
 
 def find_pictures(given: Sequence[Path], out: Path) -> BoardPictureFiles:
     """Find the images among files and below folders, and group them by camera. Files below `out` are ignored.
@@ -75,27 +91,30 @@ def find_pictures(given: Sequence[Path], out: Path) -> BoardPictureFiles:
     if not paths:
         where = ", ".join(map(str, given))
         raise InputError(f"{where}: there is no picture ({', '.join(SCAN_ENDINGS)}). Name the folder that has them.")
-    names = names_below(paths)
+    heads, errors = dict[Path, ScanHead](), dict[Path, str]()
+    for path in paths:
+        try:
+            heads[path] = read_head(path)
+        except MeasurementError as error:
+            errors[path] = str(error)
+    names = names_below(heads)  # as the project, which lists these alone, names them
+    files = dict(zip(names, heads, strict=True))
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        alike = " and ".join(str(path) for name, path in zip(names, paths, strict=True) if name == twice[0])
+        alike = " and ".join(str(path) for name, path in zip(names, heads, strict=True) if name == twice[0])
         more = f", and so are {len(twice) - 1} others" if len(twice) > 1 else ""
         raise InputError(
             f"{alike} are called {twice[0]!r}{more}: names have no ending. Give files of one kind "
             "in place of the folder, as *.png."
         )
-    groups, unreadable = defaultdict[_Kind, list[str]](list), dict[str, str]()
-    turns = dict[str, int | None]()
-    for name, path in zip(names, paths, strict=True):
-        try:
-            head = read_head(path)
-        except MeasurementError as error:
-            unreadable[name] = str(error)
-            continue
+    unreadable = dict(zip(names_below(paths, errors), errors.values(), strict=True))
+    groups, turns = defaultdict[_Kind, list[str]](list), dict[str, int | None]()
+    for name, path in files.items():
         exif: Mapping[str, Any] = {}
         with suppress(*DECODING_ERRORS, OSError):
             exif = jpeg_colour_tags(path).exif
-        groups[head.width_px, head.height_px, exif_number(exif.get("FocalLength"))].append(name)
+        size = heads[path].width_px, heads[path].height_px
+        groups[*size, exif_number(exif.get("FocalLength"))].append(name)
         turns[name] = TURNS_BY_TAG.get(exif.get("Orientation", 1))
     if not groups:
         raise InputError(f"No picture can be read: {next(iter(unreadable.values())).rstrip('.')}.")
@@ -108,7 +127,7 @@ def find_pictures(given: Sequence[Path], out: Path) -> BoardPictureFiles:
         CameraPictures(name, *kind, tuple(images), {each: turns[each] for each in images if each not in groups[kind]})
         for name, (kind, images) in zip(_names(list(kinds)), kinds.items(), strict=True)
     ]
-    return BoardPictureFiles(dict(zip(names, paths, strict=True)), tuple(cameras), unreadable)
+    return BoardPictureFiles(files, tuple(cameras), unreadable)
 
 
 def _files(given: Iterable[Path], out: Path) -> Iterator[Path]:

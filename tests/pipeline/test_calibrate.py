@@ -89,7 +89,7 @@ def picture(number: int) -> NDArray[np.uint8]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("board")
     for number in range(len(TURNS)):
-        Image.fromarray(picture(number)).save(made / f"p{number}.png")
+        Image.fromarray(picture(number)).save(made / "own" / f"p{number}.png")
     return made
 
 
@@ -158,12 +158,14 @@ CALIBRATED_BOARD = ("--board", "7x5", "--square", "2cm")
 @pytest.fixture(scope="module")
 def calibrated_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("pictures")
+    for folder in ("own", "other", "torn"):
+        (made / folder).mkdir()
     for number in range(len(TURNS)):
         shown = np.rot90(picture(number)) if number == 4 else picture(number)  # of the same camera, held upright
-        Image.fromarray(shown).save(made / f"p{number}.png")
-    Image.fromarray(np.full((SIZE_PX[1], SIZE_PX[0]), 128, np.uint8)).save(made / "grey.png")
-    Image.fromarray(np.pad(picture(1), 20, constant_values=210)).save(made / "wider.png")
-    (made / "torn.png").write_bytes((made / "p0.png").read_bytes()[:100])
+        Image.fromarray(shown).save(made / "own" / f"p{number}.png")
+    Image.fromarray(np.full((SIZE_PX[1], SIZE_PX[0]), 128, np.uint8)).save(made / "own" / "grey.png")
+    Image.fromarray(np.pad(picture(1), 20, constant_values=210)).save(made / "other" / "wider.png")
+    (made / "torn" / "torn.png").write_bytes((made / "own" / "p0.png").read_bytes()[:100])
     return made
 
 
@@ -192,7 +194,7 @@ def result(calibrated_folder: Path, calibrations: list[CalibrationResult]) -> di
 
 def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any], calibrated_folder: Path) -> None:
     (camera,), out = result["cameras"], calibrated_folder / "calibration"
-    assert list(result["unreadable"]) == ["torn"]
+    assert list(result["unreadable"]) == ["torn/torn"]
     assert not any("targets was measured" in problem for problem in result["problems"])  # each has its own reason
     assert list(result["not_calibrated"]) == ["camera-440x360"]  # and costs the other camera nothing
     assert (camera["name"], camera["image_size_px"], camera["images_used"]) == ("camera-400x320", list(SIZE_PX), 5)
@@ -289,7 +291,7 @@ def save_picture(path: Path, size: tuple[int, int], tag: int = 1, focal_mm: floa
     exif[0x0112] = tag
     if focal_mm is not None:
         exif.get_ifd(0x8769)[0x920A] = focal_mm
-    path.parent.mkdir(exist_ok=True)
+    path.parent.mkdir(exist_ok=True, parents=True)
     Image.new("L", size).save(path, exif=exif)
 
 
@@ -308,6 +310,10 @@ def test_pictures_are_sorted_by_size_and_focal_length_and_results_are_no_picture
         save_picture(tmp_path / "focal" / f"{name}.jpg", (40, 30), focal_mm=focal_mm)
     cameras = find_pictures([tmp_path / "focal"], tmp_path / "out").cameras
     assert {camera.name for camera in cameras} == {"camera-24mm", "camera-50mm"}
+    save_picture(tmp_path / "parts" / "own" / "e.png", (40, 30))
+    (tmp_path / "parts" / "torn.png").write_bytes(b"")
+    found = find_pictures([tmp_path / "parts"], tmp_path / "out")
+    assert (list(found.files), list(found.unreadable)) == (["e"], ["torn"])  # as the project names what it lists
 
 
 def test_a_picture_turned_by_a_quarter_is_of_the_same_camera(tmp_path: Path) -> None:
