@@ -17,12 +17,13 @@ from adjust.problem.observations import ObservationKind
 from measure.flags import Status
 from pipeline.errors import InputError
 from pipeline.text.csv_table import Row, csv_line, read_csv
-from pipeline.text.files import FilePath, atomic_path, image_name, read_bytes
+from pipeline.text.files import SMALLEST_SIGMA, FilePath, atomic_path, image_name, read_bytes
 from pipeline.types import Array
 
 COLUMNS = (
     "image", "point", "kind", "x_mm", "y_mm", "sx_mm", "sy_mm", "rho", "col_px", "row_px", "status", "reason",
 )  # fmt: skip
+LARGEST_RHO = 1.0 - 1e-7  # written: correlations of 1 are not read
 PIXEL_SIGMAS = ("scol_px", "srow_px")  # columns of files in pixels only; rho then correlates column and row
 KINDS: dict[str, ObservationKind] = {kind: kind for kind in get_args(ObservationKind)}
 
@@ -105,10 +106,19 @@ def comparator_lines(
             if math.isfinite(across):
                 pixel = f"{1000.0 * x / across:.4f}", f"{-1000.0 * y / down:.4f}"
         if point.sigma_mm is not None:
-            sx, sy = point.sigma_mm.tolist()
-            sigma_rho = f"{sx:.7f}", f"{sy:.7f}", f"{point.rho:.4f}"
+            sx, sy = (_sigma_text(each) for each in point.sigma_mm.tolist())
+            rho = f"{point.rho:.4f}"
+            if float(rho) in (-1.0, 1.0):  # rounded
+                rho = f"{min(max(point.rho, -LARGEST_RHO), LARGEST_RHO):.7f}"
+            sigma_rho = sx, sy, rho
         names, ends = csv_line((point.image, point.point, point.kind)), csv_line((point.status, point.reason))
         yield f"{','.join((names, *place, *sigma_rho, *pixel, ends))}\n"
+
+
+def _sigma_text(sigma_mm: float) -> str:
+    """A standard deviation, never rounded to 0, which would not be read."""
+    text = f"{sigma_mm:.7f}"
+    return text if float(text) else f"{max(sigma_mm, SMALLEST_SIGMA):.3g}"
 
 
 def _single_line(name: str) -> str:
@@ -155,7 +165,18 @@ def describe_decisions(decided: Mapping[CameraPerson, int]) -> str:
 def read_pitches(path: Path) -> dict[str, tuple[float, float]]:
     """Read the pixel pitch by image, µm across and down, from the lines above the table."""
     text = read_bytes(path).decode("utf-8", "replace")
-    return {image: (float(x), float(y)) for image, x, y in _PITCH.findall(text)}
+    pitches = {}
+    for found in _PITCH.finditer(text):
+        image, *given = found.groups()
+        try:
+            x, y = map(float, given)
+        except ValueError:
+            x = y = math.nan
+        if not min(x, y) > 0.0 or math.isinf(max(x, y)):
+            line = text.count("\n", 0, found.start()) + 1
+            raise InputError(f"{path}, line {line}: the pitch of {image} is to be two numbers in µm. Correct the line.")
+        pitches[image] = (x, y)
+    return pitches
 
 
 def read_comparator(path: FilePath, pitch_um: tuple[float, float] | None = None) -> tuple[ComparatorPoint, ...]:
@@ -225,6 +246,9 @@ def _point(row: Row, pitch_um: tuple[float, float] | None) -> ComparatorPoint:
         raise row.error(
             names[2], "an observation's standard deviation cannot be 0; leave it blank for the project's own."
         )
+    for given, name in ((sx, names[2]), (sy, names[3])):
+        if given is None and not (sx is None and sy is None):
+            raise row.error(name, f"is blank, but {names[2]} and {names[3]} go together. Give both, or none.")
     rho = row.number("rho") or 0.0
     if not math.fabs(rho) < 1.0:
         raise row.error("rho", f"is a correlation and must lie between -1 and 1, not {rho:g}.")

@@ -21,7 +21,7 @@ from pipeline.files.camera_file import camera_text, read_camera
 from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_file import Project, read_project
 from pipeline.rendered.scene_file import read_scene
-from pipeline.results.comparator_file import read_comparator, write_comparator
+from pipeline.results.comparator_file import ComparatorPoint, read_comparator, read_pitches, write_comparator
 from pipeline.text.files import check_writable, write_atomically
 from pipeline.text.toml_tables import read_toml
 
@@ -249,6 +249,28 @@ def test_comparator_coordinates_have_y_up_and_survive_writing(tmp_path: Path) ->
     assert second.xy_mm is None
     assert second.status is Status.ABSENT
     assert second.reason == 'outside, "far" off'
+
+
+@pytest.mark.parametrize(
+    ("sigma_mm", "rho", "wanted"),
+    [((0.01, 0.02), 0.99997, 0.99997), ((0.01, 0.02), -1.0, -1.0 + 1e-7), ((2e-8, 0.02), 0.5, 0.5)],
+)
+def test_what_is_written_of_a_marks_precision_is_read(
+    sigma_mm: tuple[float, float], rho: float, wanted: float, tmp_path: Path
+) -> None:
+    """Not rounded to a correlation of 1, or a standard deviation of 0."""
+    point = ComparatorPoint("f", "1", "target", np.zeros(2), np.array(sigma_mm), rho, Status.MEASURED, "")
+    write_comparator(tmp_path / "comparator.csv", [point], {})
+    (mark,) = read_comparator(tmp_path / "comparator.csv")
+    assert mark.rho == pytest.approx(wanted, abs=1e-9)
+    np.testing.assert_allclose(np.asarray(mark.sigma_mm), sigma_mm)
+
+
+def test_half_a_precision_and_a_pitch_that_is_no_number_are_refused(tmp_path: Path) -> None:
+    text = "image,point,x_mm,y_mm,sx_mm,sy_mm\nf,1,2,3,0.1,\n"
+    refused(read_comparator, written(tmp_path, "half.csv", text), ["line 2, column sy_mm: is blank", "Give both"])
+    pitch = written(tmp_path, "pitch.csv", f"# pitch of f: 1.2.3 µm across, 20 µm down\n{text}")
+    refused(read_pitches, pitch, ["line 1: the pitch of f is to be two numbers"])
 
 
 def test_the_projects_film_is_what_measuring_believes_of_it(tmp_path: Path) -> None:
