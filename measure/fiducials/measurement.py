@@ -101,7 +101,9 @@ def _search_frame(
     frame, result = found.frame, found.result
     lines = _read(scan, layout, frame) if options.writing == "all" else None
     if frame is None:
-        return replace(absent_frame(scan, layout, found.misfit, options.rotation_deg, pitch_um), writing=lines)
+        absent = absent_frame(scan, layout, found.misfit, options.rotation_deg, pitch_um)
+        other = _fitting_pose(scan, layout, pitch_um, options)
+        return replace(absent, writing=lines, problems=(*other, *absent.problems))
     is_faint, own, against = frame.is_faint, frame.placement.pose, NO_REASON
     pose = decide_pose(frame, lines or ())
     if options.pose == "auto":
@@ -127,6 +129,20 @@ def _search_frame(
     if frame.options.film_model != options.film_model:
         problems.append(_OBLIQUE)
     return replace(present_frame(frame, pose, pitch_um, problems, _FAINT if is_faint else chance), writing=lines)
+
+
+def _fitting_pose(
+    scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
+) -> tuple[Reason, ...]:
+    """Name the scan orientation in which the marks fit where they do not in the set one."""
+    frame = None if options.pose == "auto" else find_frame(scan, layout, pitch_um, replace(options, pose="auto")).frame
+    if frame is None or not frame.unblemished:
+        return ()
+    sentence = (
+        f"the marks fit in the scan orientation {decide_pose(frame, ()).name}, not in {options.pose}: this, or the "
+        "sign or order of the given coordinates, is wrong."
+    )
+    return (Reason(sentence, Code.POSE),)
 
 
 def _read(

@@ -111,6 +111,16 @@ def test_a_pose_of_the_user_that_the_picture_contradicts_is_reported() -> None:
     )
 
 
+@pytest.mark.study
+def test_a_set_orientation_in_which_nothing_fits_is_told_with_the_one_that_does() -> None:
+    """As where y of the given coordinates has the wrong sign: tone or camera were blamed."""
+    uneven = draw.lay_out([MarkShape(draw.RING_CROSS)] * 4, ((7.0, -7.0), (-7.0, -6.4), (-7.0, 5.6), (5.8, 7.0)))
+    matrix = draw.pixel_from_camera("180m")
+    result = draw.measure_grey(draw.frame_picture(uneven, matrix), uneven, FiducialOptions(pose="0"))
+    assert not any(mark.status.is_observation for mark in result.marks)
+    assert result.problems[0].startswith("the marks fit in the scan orientation 180m, not in 0: this, or the sign or")
+
+
 def test_marks_places_decide_where_they_are_not_symmetric() -> None:
     uneven = draw.lay_out([MarkShape(draw.RING_CROSS)] * 4, ((7.0, -7.0), (-7.0, -7.0), (-7.0, 6.0), (6.5, 7.0)))
     matrix = draw.pixel_from_camera("90")
