@@ -390,6 +390,11 @@ def check_frames(
     checked, films = check_own_figures(check_second_places(frames)), [film.sigma_mm] * len(frames)
     found = {i: _misfit(*pair, layout, film) for i, pair in enumerate(zip(checked, pitches_um, strict=True))}
     misfits = {place: each for place, each in found.items() if each is not None}
+    # Frames of another size than the given coordinates tell nothing of what those of the camera have in common.
+    stretched = [place for place in misfits if any(Code.PITCH in each.codes for each in checked[place].problems)]
+    if 2 * len(stretched) < len(misfits):
+        for place in stretched:
+            misfits[place] = replace(misfits[place], film_mm=film.sigma_mm, hypothesis=Hypothesis.PITCH)
     if misfits:
         shared, problem = _explain_together(misfits, layout, film.sigma_mm)
         common = [problem] if problem else []

@@ -227,6 +227,18 @@ def test_a_mark_whose_edges_alone_put_it_elsewhere_is_weak() -> None:
     assert "its edges put it 0.10 px elsewhere" in checked[0].marks[5].reason
 
 
+def test_two_frames_of_another_size_do_not_make_three_right_ones_stretched() -> None:
+    rng = np.random.default_rng(4)
+    frames = make_frames(make_layout(FOUR), 3, rng)
+    larger = make_frames(make_layout([(1.03 * x, 1.03 * y) for x, y in FOUR]), 2, rng)
+    other = [
+        replace(each, problems=(Reason("the marks' separations suggest another pitch", Code.PITCH),)) for each in larger
+    ]
+    checked = checked_together([*frames, *other], make_layout(FOUR))
+    assert [len(frame.problems) for frame in checked] == [0, 0, 0, 1, 1]
+    assert weak(checked) == set()
+
+
 def test_where_edges_put_all_marks_elsewhere_their_drawing_is_not_true_and_none_is_weak() -> None:
     """What noise does not explain makes a mark less well known; weak only where it may be half a pixel off."""
     layout = make_layout(EIGHT)
