@@ -295,7 +295,7 @@ def _part_faults(network: Network) -> Faults:
 
 def _image_faults(network: Network) -> Faults:
     """Frames with too few object points or fiducials; those in several parts of a frame count once."""
-    observations, of_mark = network.observations, network.frame_numbers[network.image_numbers]
+    observations, of_mark = network.observations, network.observed_frames
     names, points = observations.numbered_points
     kinds = observations.has_kind("fiducial") + 2 * observations.has_kind("join")  # all others are object points
     marks = np.sort((of_mark * 3 + kinds) * len(names) + points)

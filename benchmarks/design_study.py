@@ -355,7 +355,7 @@ def _draw(places: Sequence[float] | np.ndarray[Any, Any], curves: dict[str, list
     axes = figure.add_subplot()
     for name, values in curves.items():
         axes.plot(places, np.where(np.isfinite(values), values, np.nan), marker="o", markersize=4, label=name)
-    axes.set_ylabel("expected sigma, µm")
+    axes.set_ylabel("expected standard deviation, µm")
     axes.grid(visible=True, which="both", color="0.9")
     return axes
 

@@ -28,7 +28,7 @@ from pipeline.progress import Reporter
 from pipeline.provenance import hash_file
 from pipeline.publishing import Unpublished, unpublished
 from pipeline.report.data import ReportData
-from pipeline.report.load import adjusted_data, frame_data, measured_data, report_data
+from pipeline.report.load import adjusted_data, frame_data, measured_data, report_data, with_stored_adjustment
 from pipeline.report.page import write_frame_page, write_report
 from pipeline.results import comparator_file
 from pipeline.results.adjustment_file import covariance_path, read_adjustment, write_adjustment
@@ -82,7 +82,9 @@ def run_measure(project: Project, reporter: Reporter, work: WorkOptions | None =
             own = tuple(scan for scan in scans if scan.verdict not in (Verdict.WAITING, Verdict.OLD))
             return replace(archive_summary(ArchiveStatus(own), {f"part {part} of {parts}": path}), parts=parts)
         digest = run.measure()
-        data = measured_data(project, run.new.current_path) if len(project.scans) <= _ONE_BY_ONE else None
+        data = None
+        if len(project.scans) <= _ONE_BY_ONE:
+            data = with_stored_adjustment(measured_data(project, run.new.current_path), project)
         run.publish()
     if project.images_path is not None:
         run.fill_images(measured_scans(project.measurement_path, digest))
@@ -164,7 +166,7 @@ def run_frame_pages(project: Project, images: Sequence[str], reporter: Reporter)
         data = frame_data(project, run.new.current_path, frozenset(images))
         pages = {image: project.frame_page_path(image) for image in images}
         with run.thumbnails(data) as pictures:
-            for done, (image, path) in enumerate(pages.items()):
+            for done, (image, path) in enumerate(pages.items(), 1):
                 count(image, done, len(pages))
                 write_frame_page(replace(data, thumbnail=pictures.get), image, run.new.place(path))
         run.new.publish()

@@ -21,7 +21,7 @@ from pipeline.report.data import ReportData, ReportedProblem, current_scans
 from pipeline.report.data import frames as report_frames
 from pipeline.report.fiducials import MarkDistance, correction_sentence, figure
 from pipeline.report.load import frame_counts
-from pipeline.report.numbers import value_and_sigma
+from pipeline.report.numbers import typed, value_and_sigma
 from pipeline.report.parameters import CameraValue, camera_values
 from pipeline.report.verdict import Level, ReportVerdict, judge, sigma0_bounds
 from pipeline.results.adjustment_record import AdjustmentRecord
@@ -52,6 +52,7 @@ class Summary:
     values : of the calibrated cameras.
     unit : of lengths in images.
     parts : number of shards of the scans, if these are the scans of one.
+    is_adjusted : whether adjustment.json, though not shown, is of the marks and settings.
     """
 
     verdict: ReportVerdict
@@ -65,6 +66,7 @@ class Summary:
     unit: ImageUnit = FILM_UNIT
     verdicts: Mapping[Verdict, int] = field(default_factory=dict)
     parts: int = 0
+    is_adjusted: bool = False
 
     @property
     def finds_no_frame(self) -> bool:
@@ -115,6 +117,7 @@ def summarise(data: ReportData, files: Mapping[str, Path]) -> Summary:
         values={name: camera_values(data, name) for name, camera in cameras.items() if camera.is_calibrated},
         unit=next(iter(data.image_units.values()), FILM_UNIT),
         verdicts=frame_counts(data, report_frames(data)) if data.measurement is not None else {},
+        is_adjusted=data.stored_adjustment == "current",
     )
 
 
@@ -199,7 +202,7 @@ def _camera_table(adjustment: AdjustmentRecord, values: Mapping[str, Sequence[Ca
     for name, rows in values.items():
         for each in rows:
             words = f"{each.name} {each.meaning}".strip()
-            cells = (words, *value_and_sigma(each.value, each.sigma), each.unit)
+            cells = (words, *map(typed, value_and_sigma(each.value, each.sigma)), each.unit)
             table.add_row(*([Text(name)] if len(values) > 1 else []), *cells)
     return table
 

@@ -19,13 +19,14 @@ SPELLED = {
     "σ": "sigma", "µ": "u", "μ": "u", "±": "+-", "₀": "0", "²": "^2", "°": " deg", "×": "x", "′": "'", "–": "-",
     "—": "-", "−": "-", "…": "...", "·": ".", "√": "sqrt", "≤": "<=", "≥": ">=",
 }  # fmt: skip
+_MINUS = re.compile(r"(?<!\w)−(?=\d)")
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
 
 
 def plain(text: str) -> str:
-    """Text with control characters escaped, since names could recolour or rewrite the terminal, and without credentials
-    and signatures in addresses."""
-    return _CONTROL.sub(lambda found: ascii(found[0])[1:-1], public_text(text))
+    """Text with control characters escaped, since names could recolour or rewrite the terminal, without credentials and
+    signatures in addresses, and with the minus sign that calculators take."""
+    return _CONTROL.sub(lambda found: ascii(found[0])[1:-1], _MINUS.sub("-", public_text(text)))
 
 
 class PlainConsole(Console):

@@ -151,7 +151,9 @@ class Numbering:
     def _group_meetings(self, group_of: Indices, count: int) -> csr_array:
         """Incidence matrix (b, g) of blocks and groups; further observations follow the blocks as more rows."""
         # group_of: group of each unknown by position, ABSENT for none.
-        groups = [self._frame_of_rows if self._blocks.are_points else group_of[self.problem.places[:, 0]]]
+        groups = [
+            self.problem.network.observed_frames if self._blocks.are_points else group_of[self.problem.places[:, 0]]
+        ]
         blocks = [self._blocks.of]
         for i, further in enumerate(self.problem.further):
             groups.append(group_of[further.positions])
@@ -173,12 +175,12 @@ class Numbering:
         points = points[(unknowns.sigma[points] > 0.0).any(axis=1) & ~tied[points].any(axis=1)]
         free = np.append(unknowns.sigma > 0.0, False)  # the last stands for ABSENT
         if free[points].sum() <= free[of_frames].sum():
-            return _Blocks(of_frames, self._frame_of_rows, are_points=False)
+            return _Blocks(of_frames, self.problem.network.observed_frames, are_points=False)
         of_point = np.full(len(unknowns) + 1, len(points), dtype=np.intp)  # the last stands for ABSENT
         of_point[points[:, 0]] = np.arange(len(points))
         block = of_point[np.where(problem.is_fiducial, ABSENT, problem.places[:, 0])]
         nothing = np.full((len(of_frames), 3), ABSENT, dtype=np.intp)  # the frames' other observations own nothing
-        block = block + np.where(block == len(points), self._frame_of_rows, 0)
+        block = block + np.where(block == len(points), self.problem.network.observed_frames, 0)
         return _Blocks(np.concatenate([points, nothing]), block, are_points=True)
 
     @cached_property
@@ -191,11 +193,6 @@ class Numbering:
         for (frame, _), pair in unknowns.join.items():
             own[frame].append(pair)
         return side_by_side([np.concatenate(each) for each in own.values()])
-
-    @cached_property
-    def _frame_of_rows(self) -> Indices:
-        """(n,) number of the frame of each observation."""
-        return self.problem.network.frame_numbers[self.problem.image_numbers]
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,12 @@ FEWEST_KNOWN = 10  # fewer known points than this stay in every fit: they define
 UM_PER_MM = 1000.0
 ROUNDS = 3  # rounds of selecting distortion, scanner terms and transformation in turn
 
+RULE = (
+    "From few unknowns to many, a richer model is taken only where it fits significantly better (F-test at 1 %, or an "
+    f"AICc lower by more than {DECISIVE:g}) and predicts points left out better."
+)
+TILTED = "Projective is what film makes that lay at an angle to scanner or camera, bilinear has no such cause"
+
 Progress = Callable[[str, int], None]
 
 
@@ -440,10 +446,13 @@ def lenses(network: Network, transformation: Transformation, with_sets: bool) ->
 
 
 def simplest_sufficient(candidates: Sequence[Candidate]) -> Candidate | None:
-    """Select the simplest candidate that no richer one improves significantly; None without a solution."""
-    chosen = None
+    """Select the simplest candidate that no richer one improves significantly; None without a solution.
+
+    Of transformations with equally many unknowns, a later one in `TRANSFORMATIONS` has to be significantly better.
+    """
+    chosen, rank = None, {kind: number for number, kind in enumerate(TRANSFORMATIONS)}
     solved = [each for each in candidates if not each.problem]
-    for candidate in sorted(solved, key=lambda each: (each.unknowns, each.vpv)):
+    for candidate in sorted(solved, key=lambda one: (one.unknowns, rank.get(one.model.transformation, 0), one.vpv)):
         if chosen is None or _is_better(candidate, chosen):
             chosen = candidate
     return chosen
@@ -497,7 +506,7 @@ def verdict(given: Model, chosen: Candidate | None) -> str:
 
 
 def reasons(candidates: Sequence[Candidate], chosen: Candidate | None) -> tuple[str, ...]:
-    """Explain the rejection of every candidate that differs from the chosen one in one respect only.
+    """State the rule, and why every candidate that differs from the chosen one in one respect only was not chosen.
 
     Respects are distortion, transformation and scanner terms.
     """
@@ -509,25 +518,43 @@ def reasons(candidates: Sequence[Candidate], chosen: Candidate | None) -> tuple[
 
     own = respects(chosen.model)
     differences = (sum(a != b for a, b in zip(respects(each.model), own, strict=True)) for each in candidates)
-    return tuple(_reason(each, chosen) for each, count in zip(candidates, differences, strict=True) if count == 1)
+    return (RULE, *(_reason(each, chosen) for each, count in zip(candidates, differences, strict=True) if count == 1))
 
 
 def _reason(other: Candidate, chosen: Candidate) -> str:
-    name = other.model.name
+    name, difference, more = other.model.name, other.aicc - chosen.aicc, other.unknowns - chosen.unknowns
     if other.problem:
-        return f"{name} cannot be had: {other.problem}"
+        return f"{name} has no solution: {other.problem}"
     if chosen.model.contains(other.model):
-        test = f_test(other, chosen)
-        return f"{name} is too simple: {_f_words(test)}."
-    if other.model.contains(chosen.model) and other.unknowns > chosen.unknowns:
+        return f"{name} is too simple: what it lacks is significant, {_f_words(f_test(other, chosen))}."
+    if other.model.contains(chosen.model) and more > 0:
         test = f_test(chosen, other)
-        needless = "adds nothing that is significant" if test.p >= LEVEL else "fits significantly better"
-        return f"{name} {needless}: {_f_words(test)}."
-    better = "higher" if other.aicc >= chosen.aicc else "lower"
-    size = "richer" if other.unknowns > chosen.unknowns else "no richer"
-    return f"{name}, {size}, has an AICc {abs(other.aicc - chosen.aicc):.1f} {better}."
+        if test.p >= LEVEL:
+            return f"{name} is not needed: what it adds is not significant, {_f_words(test)}."
+        return f"{name} fits significantly better, {_f_words(test)}{_prediction(other, chosen)}."
+    size = f"with {abs(more)} {'more' if more > 0 else 'fewer'} unknowns" if more else "with as many unknowns"
+    aicc = f"its AICc is {abs(difference):.1f} {'higher' if difference >= 0 else 'lower'}"
+    if difference > DECISIVE:
+        return f"{name}, {size}, fits worse for its unknowns: {aicc}."
+    if difference < -DECISIVE:
+        return f"{name}, {size}, fits better: {aicc}{_prediction(other, chosen)}."
+    films = chosen.model.transformation, other.model.transformation
+    cause = f". {TILTED}" if films == ("projective", "bilinear") else ""
+    return f"{name}, {size}, fits about as well: {aicc}, and only more than {DECISIVE:g} decides{cause}."
+
+
+def _prediction(other: Candidate, chosen: Candidate) -> str:
+    """Compare the predictions of a candidate that fits better with those of the chosen one; "" where it is as good."""
+    theirs, own = other.cross_validation, chosen.cross_validation
+    if theirs is None:
+        return ", but cannot be tested on points left out"
+    if own is None or theirs.sigmas < own.sigmas:
+        return ""
+    figures = f"{theirs.sigmas:.3g} and {own.sigmas:.3g} standard deviations off"
+    return f", but predicts points left out no better than the selected one ({figures})"
 
 
 def _f_words(test: Nested) -> str:
     chance = f"p = {test.p:.3f}" if test.p >= 0.001 else "p < 0.001"
-    return f"F({test.degrees[0]}, {test.degrees[1]}) = {test.f:.3g}, {chance}"
+    f = f"{test.f:.3g}" if test.f < 1000.0 else f"{test.f:.0f}"
+    return f"F({test.degrees[0]}, {test.degrees[1]}) = {f}, {chance}"

@@ -261,6 +261,11 @@ class Network:
         return np.array([number.setdefault(image.frame, len(number)) for image in self.images], dtype=np.intp)
 
     @cached_property
+    def observed_frames(self) -> Indices:
+        """(n,) number of each observation's frame."""
+        return self.frame_numbers[self.image_numbers]
+
+    @cached_property
     def joins(self) -> dict[tuple[str, str], Indices]:
         """Rows of the observations of each join, by frame and point."""
         rows: dict[tuple[str, str], list[int]] = {}

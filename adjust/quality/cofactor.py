@@ -226,7 +226,7 @@ def image_equations(at: Linearised, positions: Indices) -> Iterator[tuple[int, A
     Number of the frame, derivatives (n, k) by the quantities at some positions, right sides (n,).
     """
     problem = at.rows.numbering.problem
-    frames = problem.network.frame_numbers[problem.image_numbers]
+    frames = problem.network.observed_frames
     order = np.argsort(frames, kind="stable")
     own = np.append(problem.unknowns.sigma > 0.0, False)  # the last entry is ABSENT
     own[: problem.unknowns.shared_count] = False

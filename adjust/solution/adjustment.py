@@ -519,7 +519,7 @@ def _frames_by_error(result: Adjustment, predicted: bool) -> list[_FrameError]:
     """Frames by their errors as the others predict them, or by their v'Pv, the largest first."""
     network = result.network
     camera_of = {image.frame: image.camera for image in network.images}
-    numbers, of_frame = np.unique(network.frame_numbers[network.image_numbers], return_inverse=True)
+    numbers, of_frame = np.unique(network.observed_frames, return_inverse=True)
     names, cameras = np.array([*camera_of.items()])[numbers].T
     variances = np.diagonal(network.observations.covariance_mm2, axis1=1, axis2=2)
     squares = (result.residuals.v_mm**2 / variances).sum(axis=1)  # without a solution no residual is standardised

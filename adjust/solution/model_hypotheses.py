@@ -51,7 +51,7 @@ NAMED = 5  # images named in a message, and points with their errors
 RICHER: dict[Transformation, tuple[Transformation, ...]] = {  # film deformation models tried for a simpler one
     "congruent": ("similarity", "affine"),
     "similarity": ("affine", "projective"),
-    "affine": ("projective", "polynomial(2)"),
+    "affine": ("projective", "bilinear", "polynomial(2)"),
 }
 CLEAR = 3.0  # standard deviations above which one of two changes of a board is told
 FEWEST_GIVEN, FEWEST_IMAGES = 5, 2  # given points, and images of one, that tell a wrong one

@@ -244,19 +244,15 @@ def run_choose(project: Project, reporter: Reporter) -> tuple[Choice, dict[str, 
 
 def print_choice(choice: Choice, console: Console, path: Path) -> None:
     """Print a table of the candidates, the verdict and the reasons."""
-    columns = ("model", "unknowns", "redundancy", "sigma0", "v'Pv", "AIC", "AICc", "left out, µm", "correlated")
+    columns = ("model", "unknowns", "sigma0", "AICc", "left out, µm")
     table = uncut_table(columns, "Candidates")
     for each in choice.candidates:
         predicted = each.cross_validation
         numbers = (
             str(each.unknowns),
-            str(each.redundancy),
             f"{each.sigma0:.3f}",
-            f"{each.vpv:.1f}",
-            f"{each.aic:.1f}",
             f"{each.aicc:.1f}",
             "none" if predicted is None else f"{predicted.rms_um:.2f}",
-            str(len(each.correlated)),
         )
         shown = ("no solution",) if each.problem else numbers
         table.add_row(Text(each.model.name), *shown, style="bold green" if each is choice.chosen else "")

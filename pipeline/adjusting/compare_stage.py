@@ -17,7 +17,7 @@ from adjust.problem.parameter import Parameter
 from adjust.quality.lens_comparison import CameraCalibration, Comparison, Use, compare, sigmas
 from pipeline.drawing import svg
 from pipeline.errors import InputError
-from pipeline.report.numbers import fixed, value_and_sigma
+from pipeline.report.numbers import fixed, typed, value_and_sigma
 from pipeline.results.adjustment_file import observed_mm, read_adjustment, read_own_covariance
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.record_json import write_record
@@ -180,7 +180,7 @@ def _print_difference(
     comparison: Comparison, k: int, parameters: Sequence[ParameterDifference], console: Console
 ) -> None:
     first, *others = (each.name for each in comparison.calibrations)
-    columns = ("parameter", first, others[k], "difference", "sigma", "in joint sigmas", "unit")
+    columns = ("parameter", first, others[k], "difference", "sigma", "in sigmas", "unit")
     family = family_of(comparison.calibrations[0].lens.distortion.family)
     table = uncut_table(columns, f"{others[k]} less {first}")
     for row in parameters:
@@ -189,7 +189,8 @@ def _print_difference(
         size = "both fixed" if np.isnan(row.sigmas) else fixed(row.sigmas, 1, sign=True)
         values = [value_and_sigma(each, row.sigma, abs(row.first))[0] for each in (row.first, row.other)]
         unit = "mm" if row.name in ("c", "x0", "y0") else family.unit(row.name)
-        table.add_row(row.name, *values, *value_and_sigma(row.difference, row.sigma), size, unit)
+        change = value_and_sigma(row.difference, row.sigma, abs(row.first))
+        table.add_row(row.name, *map(typed, (*values, *change, size)), unit)
     console.print(table)
     field = comparison.field_um[k]
     x, y = comparison.places_mm[np.hypot(*field.T).argmax()]
@@ -199,7 +200,7 @@ def _print_difference(
         marks = comparison.fiducials_um[k]
         which = comparison.fiducials[np.hypot(*marks.T).argmax()]
         largest = _largest(marks, comparison.fiducials_covariance_um2[k])
-        console.print(Text(f"Fiducial marks after a similarity: {largest} at {which!r}."))
+        console.print(Text(f"Fiducial marks after a similarity: {largest} at fiducial {which}."))
 
 
 def _rms(differences_um: Array) -> float:

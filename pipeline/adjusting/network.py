@@ -23,7 +23,7 @@ from pipeline.files.project_file import Project
 from pipeline.files.project_tables import UNITS_MM, AdjustSettings
 from pipeline.files.target_table import TieSettings
 from pipeline.results.comparator_file import ComparatorPoint
-from pipeline.text.wording import did_you_mean, listed
+from pipeline.text.wording import counted, did_you_mean, listed
 
 OTHER_UNIT = 5.0  # ratio of lengths: film and paper deform by some percent; the nearest other unit (cm) is 10
 FEWEST_TARGETS = 3  # in an image without observed exterior orientation
@@ -166,19 +166,20 @@ def _orientable(
     if len(lost) + len(short) == len(whole):
         short = []  # the adjustment says what is wrong with all
     sentences = [
-        f"Image {image.name!r} has no part in the adjustment: it shows {fiducials[image.name]} fiducial marks, and its "
-        f"{image.transformation} transformation needs {needed[image.name]}. Look at the reasons of the others."
+        f"Image {image.name!r} has no part in the adjustment: it shows "
+        f"{counted(fiducials[image.name], 'fiducial mark')}, and its {image.transformation} transformation needs "
+        f"{needed[image.name]}. Look at the reasons of the others."
         for image in short
     ]
     sentences += [
-        f"Image {image.name!r} has no part in the adjustment: it shows {targets[image.name]} targets and needs "
-        f"{FEWEST_TARGETS}. Look at the reasons of its marks; or observe its orientation in images.csv, with standard "
-        "deviations."
+        f"Image {image.name!r} has no part in the adjustment: it shows {counted(targets[image.name], 'target')} and "
+        f"needs {FEWEST_TARGETS}. Look at the reasons of its marks; or observe its orientation in images.csv, with "
+        "standard deviations."
         for image in lost
     ]
     sentences += [
-        f"Image {image.name!r} is not oriented: it shows {targets[image.name]} targets and needs {FEWEST_TARGETS}. Its "
-        "film transformation is adjusted from its fiducials. Look at the reasons of its targets."
+        f"Image {image.name!r} is not oriented: it shows {counted(targets[image.name], 'target')} and needs "
+        f"{FEWEST_TARGETS}. Its film transformation is adjusted from its fiducials. Look at the reasons of its targets."
         for image in few
         if image not in lost and expects_targets
     ]

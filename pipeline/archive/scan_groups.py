@@ -241,9 +241,9 @@ def catalogue(given: Sequence[Path], count: Count, max_pixels: int | None = None
     heads, unread = defaultdict[tuple[object, ...], list[tuple[int, ScanHead]]](list), dict[Path, str]()
     members = defaultdict[tuple[Path, int], list[tuple[Path, ScanHead]]](list)
     number = 0
-    for done, path in enumerate(files):
-        if done % _EVERY == 0:
-            count("", done, len(files))
+    for number_read, path in enumerate(files, 1):
+        if number_read % _EVERY == 0 or number_read == len(files):
+            count("", number_read, len(files))
         try:
             head = read_head(path, max_pixels)
         except MeasurementError as error:

@@ -64,8 +64,8 @@ class Work:
         known, missing = self._stored_rows(tasks)
         now = sum(row in self._now for row in known.values())  # measured for other scans in the steps before
         self._store.set_current({row: self._asked(name) for name, row in known.items()})
-        if known or len(missing) > 1:
-            rest = {"in earlier runs": len(known) - now, "in this run": now, "to go": len(missing)}
+        if known:
+            rest = {"stored already": len(known) - now, "in this run": now, "to go": len(missing)}
             reporter.say(count_sentence("measured", len(known), len(tasks), rest))
         if missing:
             self._complete(missing, len(tasks), reporter)

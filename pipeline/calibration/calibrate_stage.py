@@ -156,7 +156,7 @@ def _calibrated(
     choices: dict[str, LensChoice | None] = {}
     adjustments, not_calibrated = dict[str, Adjustment](), dict[str, str]()
     with reporter.stage("calibrating") as count:
-        for done, camera in enumerate(pictures.cameras):
+        for done, camera in enumerate(pictures.cameras, 1):
             count(camera.name, done, len(pictures.cameras))
             own = [mark for mark in marks if mark.image in camera.images and mark.image not in left_out]
             try:

@@ -236,7 +236,8 @@ class CameraIntrinsics:
             pairs = ", ".join(f"{a} and {b} {value:.2f}" for a, b, value in self.correlations)
             yield f"Correlations above {HIGHLY_CORRELATED}: {pairs}."
         if self.known_share is not None and self.known_share < 1.0:
-            yield f"The lens is known to {self.known_share:.0%} of the way to the corner; beyond it is extrapolated."
+            share = 100.0 * self.known_share
+            yield f"The lens is known to {share:.0f} % of the way to the corner; beyond it is extrapolated."
         if self.pitch_um is not None:
             c_mm = self.values["fy"].value * self.pitch_um / 1000.0
             yield f"Principal distance {c_mm:.4f} mm at {self.pitch_um:g} µm a pixel."

@@ -11,19 +11,9 @@ from pipeline.exchange.formats import FORMATS, IMPORTED, LARGEST_MISFIT_PX, Expo
 from pipeline.text.wording import counted, did_you_mean
 
 TEMPLATES = ("project", "camera", "scene", "keys")
-FAMILIES = (  # `FAMILY_NAMES`, without numpy
-    "none",
-    "torlegard",
-    "brown",
-    "australis",
-    "aicon",
-    "opencv",
-    "opencv_fisheye",
-    "juhl",
-    "ebner",
-    "gruen",
-    "legendre(n)",
-    "fourier(n)",
+# `FAMILY_NAMES`, without numpy
+FAMILIES = (
+    "none, torlegard, brown, australis, aicon, opencv, opencv_fisheye, juhl, ebner, gruen, legendre(n), fourier(n)"
 )
 
 
@@ -92,7 +82,7 @@ def import_(
         list[Path],
         typer.Argument(metavar="FILE... OUT_DIR", help="Files to read, and where the results go.", show_default=False),
     ],
-    pitch_um: Annotated[float | None, shared.pitch_option("A pixel of the pictures.")] = None,
+    pitch_um: Annotated[float | None, shared.pitch_option("Side of a pixel.")] = None,
     sigma_px: Annotated[
         float | None,
         typer.Option("--sigma-px", metavar="PX", min=1e-6, help="Standard deviation of marks that have none."),
@@ -121,7 +111,7 @@ def import_(
 
 def convert(
     file: Annotated[Path, typer.Argument(metavar="CAMERA.toml|adjustment.json", help="The lens.", show_default=False)],
-    family: Annotated[str, typer.Argument(metavar="FAMILY", help=shared.choices_help(FAMILIES), show_default=False)],
+    family: Annotated[str, typer.Argument(metavar="FAMILY", help=f"One of {FAMILIES}.", show_default=False)],
     out_dir: shared.OutDir,
     r0_mm: Annotated[
         float,

@@ -138,7 +138,7 @@ def summary_steps(project: Path, summary: "Summary") -> Iterator[str]:
     if "covariance" in files:
         yield command_step("check", project, why="compares the adjustment with OpenCV's calibration")
         yield command_step("report", project)
-    elif "check" in files:
+    elif "check" in files or summary.is_adjusted:
         yield command_step("report", project)
     elif "report" not in files:
         yield command_step("run", project, why=_ALL_STAGES)

@@ -44,52 +44,28 @@ class Design:
     def content(self) -> Content:
         """Content of design.json. A standard deviation of null: the observations do not determine the parameter."""
         expected, plan = self.expected, self.expected.plan
-        network, adjustment = expected.network, plan.adjustment
-        kinds, pictures = network.observations.kind, list(self.files.values())[1:]
-        counts = Counter(zip(network.observations.image, kinds, strict=True))
-        point_summary = {}
-        for axis, sigmas in zip("XYZ", expected.point_sigmas.T, strict=True):
-            estimated = sigmas[(sigmas > 0.0) & np.isfinite(sigmas)]
-            point_summary[axis] = {
-                "rms": rms(estimated),
-                "largest": float(estimated.max(initial=0.0)),
-                "estimated": len(estimated),
-                "undetermined": int(np.isinf(sigmas).sum()),
-            }
+        pictures, observations = list(self.files.values())[1:], expected.network.observations
+        counts = Counter(zip(observations.image, observations.kind, strict=True))
         return {
             "reseau": version("reseau"),
             "scene": str(self.scene),
             "sigma0": plan.sigma0,
-            "images_planned": len(network.images),
-            "points_planned": len(network.points),
-            "marks": {kind: kinds.count(kind) for kind in ("target", "fiducial")},
-            "observations": adjustment.conditions,
-            "unknowns": adjustment.unknowns,
-            "redundancy": adjustment.redundancy,
+            **_network(expected),
             "singular": [
                 {"parameters": [each.text for each in null.parameters], "cause": null.cause, "remedy": null.remedy}
                 for null in plan.singular
             ],
-            "warnings": adjustment.warnings,
+            "warnings": plan.adjustment.warnings,
             "cameras": {expected.camera: _camera(expected)},
             "scanners": {
                 each.name: {term: _quantity(expected, Parameter.scanner(each.name, term)) for term in each.terms}
-                for each in network.scanners
+                for each in expected.network.scanners
             },
             "photographs_alone": {parameter.text: sigma for parameter, sigma in self.alone.items()},
-            "images": {image.name: _image(expected, image, counts) for image in network.images},
+            "images": {image.name: _image(expected, image, counts) for image in expected.network.images},
             "points": dict(_points(expected)),
-            "point_summary": point_summary,
-            "distances": [
-                {
-                    "name": each.name,
-                    "sigma": plan.sigma0 * each.sigma,
-                    "redundancy": each.redundancy,
-                    "detectable": plan.sigma0 * each.detectable,
-                }
-                for each in adjustment.further
-                if each.group == "distance"
-            ],
+            "point_summary": dict(_point_summary(expected)),
+            "distances": _distances(expected),
             "reliability": _reliability(expected),
             "layouts": {
                 "count": self.layouts.count,
@@ -104,6 +80,19 @@ class Design:
             ],
             "sweeps": [_sweep(swept, path.name) for swept, path in zip(self.swept, pictures, strict=True)],
         }
+
+
+def _network(expected: Expected) -> Content:
+    """Sizes of the network."""
+    network, adjustment = expected.network, expected.plan.adjustment
+    return {
+        "images_planned": len(network.images),
+        "points_planned": len(network.points),
+        "marks": {kind: network.observations.kind.count(kind) for kind in ("target", "fiducial")},
+        "observations": adjustment.conditions,
+        "unknowns": adjustment.unknowns,
+        "redundancy": adjustment.redundancy,
+    }
 
 
 def _camera(expected: Expected) -> Content:
@@ -150,6 +139,28 @@ def _points(expected: Expected) -> Iterator[tuple[str, Content]]:
     for point in expected.network.points:
         axes = {axis: _quantity(expected, Parameter.point(point.id, axis)) for axis in "XYZ"}
         yield point.id, {**axes, "images": observed[point.id]}
+
+
+def _point_summary(expected: Expected) -> Iterator[tuple[str, Content]]:
+    for axis, sigmas in zip("XYZ", expected.point_sigmas.T, strict=True):
+        estimated = sigmas[(sigmas > 0.0) & np.isfinite(sigmas)]
+        largest, undetermined = float(estimated.max(initial=0.0)), int(np.isinf(sigmas).sum())
+        counts = {"estimated": len(estimated), "undetermined": undetermined}
+        yield axis, {"rms": rms(estimated), "largest": largest, **counts}
+
+
+def _distances(expected: Expected) -> list[Content]:
+    sigma0 = expected.plan.sigma0
+    return [
+        {
+            "name": each.name,
+            "sigma": sigma0 * each.sigma,
+            "redundancy": each.redundancy,
+            "detectable": sigma0 * each.detectable,
+        }
+        for each in expected.plan.adjustment.further
+        if each.group == "distance"
+    ]
 
 
 def _reliability(expected: Expected) -> Content:

@@ -264,7 +264,7 @@ class Alternative:
 Progress = Callable[[str, int, int], None]
 
 
-def alternatives(basis: Expected, progress: Progress | None = None) -> tuple[Alternative, ...]:
+def alternatives(basis: Expected, progress: Progress = lambda *_: None) -> tuple[Alternative, ...]:
     """Try all kinds of changes, each once. Of the photographs that could be added or rolled, the most useful of each
     kind is kept."""
     setup, tried = basis.setup, defaultdict[int, list[Alternative]](list)
@@ -273,8 +273,7 @@ def alternatives(basis: Expected, progress: Progress | None = None) -> tuple[Alt
     for done, (kind, change, changed) in enumerate(changes, 1):
         expected = expect(changed)
         tried[kind].append(Alternative(change, expected, gains(basis.camera_sigmas, expected.camera_sigmas)))
-        if progress is not None:
-            progress(change, done, len(changes))
+        progress(change, done, len(changes))
     return tuple(max(some, key=lambda alternative: alternative.usefulness) for some in tried.values())
 
 

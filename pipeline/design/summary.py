@@ -15,7 +15,7 @@ from pipeline.design.expected import FOUND, Alternative, GroupReliability, alone
 from pipeline.design.sweeps import Swept, Variations, over_layouts, sweep
 from pipeline.drawing import svg
 from pipeline.progress import Reporter
-from pipeline.report.numbers import NONE, fixed, significant, value_and_sigma
+from pipeline.report.numbers import NONE, fixed, significant, typed, value_and_sigma
 from pipeline.results.record_json import write_record
 from pipeline.terminal import uncut_table
 from pipeline.text.files import check_writable
@@ -124,7 +124,7 @@ def print_design(design: Design, console: Console) -> None:
         for row in rows:
             if row[0] == SLOPE:
                 table.add_section()
-            table.add_row(*(Text(cell) for cell in row))
+            table.add_row(*(Text(typed(cell)) for cell in row))
         if table.row_count:
             console.print(table)
     for word, path in design.files.items():

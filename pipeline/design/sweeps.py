@@ -13,6 +13,7 @@ from pipeline.design.expected import Expected, expect
 from pipeline.design.setup import Setup, scene_setup
 from pipeline.errors import InputError
 from pipeline.files.library import camera_path
+from pipeline.files.object_files import ELEMENTS
 from pipeline.rendered.scene_file import parse_scene
 from pipeline.rendered.scene_tables import Sweep
 from pipeline.text.toml_tables import Table, read_toml
@@ -20,14 +21,7 @@ from pipeline.text.wording import did_you_mean
 
 Values = dict[str, Any]
 
-EXTERIOR = {
-    "X0": ("position", 0),
-    "Y0": ("position", 1),
-    "Z0": ("position", 2),
-    "omega_deg": ("angles_deg", 0),
-    "phi_deg": ("angles_deg", 1),
-    "kappa_deg": ("angles_deg", 2),
-}
+EXTERIOR = {name: ("position" if k < 3 else "angles_deg", k % 3) for k, name in enumerate(ELEMENTS)}
 PLANNING_PITCH_UM = 20.0  # default: a scene that is only planned needs no pitch
 Progress = Callable[[str, int, int], None]
 
@@ -205,14 +199,12 @@ class Swept:
         return float(np.polyfit(x, y, 1)[0])
 
 
-def sweep(scene: Variations, number: int, planned: Sweep, progress: Progress | None = None) -> Swept:
+def sweep(scene: Variations, number: int, planned: Sweep, progress: Progress = lambda *_: None) -> Swept:
     """Carry out a sweep. number: of the sweep in the scene, for messages. Raises InputError for an unknown quantity."""
     varied = [scene.varied(number, planned, value) for value in planned.values]
     steps = []
-    for i, variation in enumerate(varied):
-        value: float | str = planned.values[i]
-        if progress is not None:
-            progress(f"{planned.quantity} = {value}", i, len(varied))
+    for done, (value, variation) in enumerate(zip(planned.values, varied, strict=True), 1):
+        progress(f"{planned.quantity} = {value}", done, len(varied))
         first = expect(variation.setup())
         adjustment = first.plan.adjustment
         sigmas = over_layouts(variation, first)

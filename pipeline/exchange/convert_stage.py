@@ -33,7 +33,7 @@ from pipeline.results.adjustment_record import (
     PrincipalPointRecord,
     Quantity,
 )
-from pipeline.results.record_json import json_text, plain_json
+from pipeline.results.record_json import json_text, record_content
 from pipeline.text.files import read_bytes
 from pipeline.text.wording import did_you_mean, listed
 from pipeline.types import Array
@@ -80,7 +80,7 @@ class Conversion:
     def as_json(self) -> dict[str, object]:
         """Content of `--json`."""
         return {
-            **plain_json(DistortionRecord.from_distortion(self.lens.lens.distortion, {})),
+            **record_content(DistortionRecord.from_distortion(self.lens.lens.distortion, {})),
             "same": self.lens.is_same,
             "largest_um": self.misfit_um,
             "rms_um": 1e3 * self.lens.rms_mm,
@@ -92,8 +92,11 @@ class Conversion:
 
     def lines(self) -> Sequence[str]:
         """Lines to be printed: the sentences and the parameters."""
+        units = dict.fromkeys(("c", "x0", "y0"), "mm")
+        unit = family(self.lens.lens.distortion.family).unit
         numbers = [
-            f"  {name:6s} {value:>16.9g}  {format(sigma, '.2g') if math.isfinite(sigma) else 'free'}"
+            f"  {name:6s} {value:>16.9g}  {f'± {sigma:.2g}' if math.isfinite(sigma) else 'free':9s}  "
+            f"{units.get(name) or unit(name)}".rstrip()
             for name, (value, sigma) in self.values.items()
             if value != 0.0 or sigma != 0.0
         ]

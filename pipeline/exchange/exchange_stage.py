@@ -29,7 +29,8 @@ from pipeline.results.comparator_file import (
     read_decision_counts,
 )
 from pipeline.text.csv_table import csv_line
-from pipeline.text.files import file_word, path_below, write_atomically, writing
+from pipeline.text.files import file_word, make_folder, path_below, write_atomically, writing
+from pipeline.text.wording import listed
 
 README = "README.txt"
 _HEAD = "Written by reseau"
@@ -74,8 +75,11 @@ def readme(what: str, head: Sequence[str], parts: Mapping[str, Sequence[str]]) -
 
 def check_folder(folder: Path) -> None:
     """Raise InputError for a folder with anything other than an earlier export, which would be overwritten."""
+    if not folder.exists():
+        return
+    make_folder(folder)
     text = (folder / README).read_bytes() if (folder / README).is_file() else b""
-    if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not text.startswith(_HEAD.encode()))):
+    if any(folder.iterdir()) and not text.startswith(_HEAD.encode()):
         raise InputError(
             f"{folder}: holds something that is no export of reseau. Name another folder, or an empty one."
         )
@@ -117,12 +121,18 @@ def run_import(format: str, paths: Sequence[Path], folder: Path, options: Import
     files: dict[str, str | bytes] = dict(incoming.tables)
     if incoming.marks:
         files["comparator.csv"] = _comparator(incoming.marks, options)
+    cameras = _cameras(incoming.cameras)
     if incoming.poses:
-        files["images.csv"] = _images(incoming.poses)
-    files |= _cameras(incoming.cameras)
+        files["images.csv"] = _images(incoming.poses, [folder / name for name in cameras])
+    files |= cameras
     if not files:
         raise InputError(f"{', '.join(map(str, paths))}: there is nothing to import in it.")
     notes = (*incoming.notes, *_unknown_notes(incoming.cameras))
+    if len(cameras) > 1 and any(pose.camera for pose in incoming.poses):
+        notes += (
+            f"images.csv names a camera file for each image, as {folder / next(iter(cameras))}: from the folder "
+            "of project.toml.",
+        )
     parts = {"Files": tuple(files), "Notes": notes}
     readme_text = readme(f"import of {format}", ["From:", *(f"- {path.name}" for path in paths)], parts)
     publish(folder, files, readme_text)
@@ -131,12 +141,12 @@ def run_import(format: str, paths: Sequence[Path], folder: Path, options: Import
 
 def _unknown_notes(cameras: Sequence[CameraFile]) -> Iterator[str]:
     """Notes on what the camera files assume because the other program's files do not contain it."""
+    if held := [camera.name for camera in cameras if camera.principal_distance_sigma_mm == 0.0]:
+        yield (
+            f"{listed(held)}: the files give no standard deviations. The calibration is held fixed; give [sigma] in "
+            "the camera file if it is to be adjusted."
+        )
     for camera in cameras:
-        if camera.principal_distance_sigma_mm == 0.0:
-            yield (
-                f"{camera.name}: the files give no standard deviations. The calibration is held fixed; give [sigma] in "
-                "the camera file if it is to be adjusted."
-            )
         if camera.fiducials and camera.principal_point_mm is not None:
             x, y = camera.principal_point_mm
             yield (
@@ -172,24 +182,30 @@ def _comparator(marks: Sequence[ForeignMark], options: ImportOptions) -> str:
     return "".join(comparator_lines(rows, dict.fromkeys(sorted({mark.image for mark in marks}), pitch)))
 
 
-def _images(poses: Sequence[ForeignPose]) -> str:
-    """images.csv without standard deviations: approximate orientations."""
-    lines = ["# orientations of another program, as approximations", ",".join(("image", *ELEMENTS))]
+def _images(poses: Sequence[ForeignPose], cameras: Sequence[Path]) -> str:
+    """images.csv without standard deviations: approximate orientations, and camera files where there are several."""
+    file_of = {path.name: path.as_posix() for path in cameras if len(cameras) > 1}
+    columns = ("image", *ELEMENTS, "camera") if file_of else ("image", *ELEMENTS)
+    lines = ["# orientations of another program, as approximations", ",".join(columns)]
     for pose in poses:
         angles = np.degrees(angles_from_rotation(pose.rotation))
-        lines.append(csv_line([pose.image, *(repr(float(value)) for value in (*pose.station, *angles))]))
+        camera = [file_of.get(_camera_file(pose.camera), "")] if file_of else []
+        lines.append(csv_line([pose.image, *(repr(float(value)) for value in (*pose.station, *angles)), *camera]))
     return "\n".join(lines) + "\n"
+
+
+def _camera_file(name: str) -> str:
+    return f"{file_word(name or 'camera')}.toml"
 
 
 def _cameras(cameras: Sequence[CameraFile]) -> dict[str, str]:
     """camera.toml, or one file per name where there are several cameras; equal ones once."""
     files: dict[str, str] = {}
     for camera in cameras:
-        name = "camera.toml" if len(cameras) == 1 else f"{file_word(camera.name or 'camera')}.toml"
+        name = "camera.toml" if len(cameras) == 1 else _camera_file(camera.name)
         text = camera_text(replace(camera, path=Path(name)), lambda *_: "")
         if files.setdefault(name, text) != text:
             raise InputError(
-                f"two cameras of the name {camera.name!r} differ, as those of rectified frames do, which have sizes of "
-                "their own. Import them one by one, each into its own folder."
+                f"two cameras of the name {camera.name!r} differ. Import them one by one, each into its own folder."
             )
     return files

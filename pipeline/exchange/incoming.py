@@ -115,11 +115,12 @@ class ForeignMark:
 @dataclass(frozen=True)
 class ForeignPose:
     """Exterior orientation of an image: rotation (3, 3) from the object to axes x right, y up, looking along -z;
-    station (3,)."""
+    station (3,); camera: name of its camera, "" where the other program has one of all images."""
 
     image: str
     rotation: Array
     station: Array
+    camera: str = ""
 
 
 @dataclass(frozen=True)
@@ -220,6 +221,6 @@ def fiducial_camera(name: str, places: Mapping[str, Array]) -> CameraFile:
     )
 
 
-def foreign_pose(image: str, rotation: Array, translation: Array) -> ForeignPose:
+def foreign_pose(image: str, rotation: Array, translation: Array, camera: str) -> ForeignPose:
     """Convert an orientation with axes x right, y down, z forward: `camera = rotation X + translation`."""
-    return ForeignPose(image, np.asarray(Y_DOWN_Z_FORWARD @ rotation), np.asarray(-rotation.T @ translation))
+    return ForeignPose(image, np.asarray(Y_DOWN_Z_FORWARD @ rotation), np.asarray(-rotation.T @ translation), camera)

@@ -31,6 +31,7 @@ from pipeline.exchange.incoming import (
     foreign_pose,
     opencv_camera,
 )
+from pipeline.files.camera_file import CameraFile
 from pipeline.files.opencv_file import FISHEYE_MODEL, read_pixel_camera
 from pipeline.opencv_check.opencv_calibration import FISHEYE, INTERIOR, NAMES, fixed, model_names, opencv_values
 from pipeline.resampling.canvas import Canvas, outline_canvas
@@ -427,20 +428,29 @@ def _yaml(frame: PinholeFrame, lens_reach: str | None) -> str:
 
 
 def import_opencv(paths: Sequence[Path], options: ImportOptions) -> Incoming:
-    """Read files of cv2.FileStorage: matrix, distortion and size as camera files; R and t, if given, as
-    orientations."""
-    cameras, poses = [], []
+    """Read files of cv2.FileStorage: matrix, distortion and size as camera files; R and t, if given, as orientations.
+
+    Cameras of one name that differ, as those of rectified frames of different sizes do, get their pictures' names too.
+    """
+    read, turns = list[tuple[str, CameraFile]](), dict[str, tuple[Array, Array]]()
     for path in paths:
         found, storage = read_pixel_camera(path)
         name = storage.getNode("camera").string() or path.stem
         picture = image_name(storage.getNode("image").string() or path.stem)
-        cameras.append(
-            opencv_camera(path, name, found.interior_px, found.distortion, found.size_px, options, OPENCV, found.family)
+        camera = opencv_camera(
+            path, name, found.interior_px, found.distortion, found.size_px, options, OPENCV, found.family
         )
+        read.append((picture, camera))
         turn, shift = storage.getNode("R").mat(), storage.getNode("t").mat()
         if turn is not None and shift is not None:
-            poses.append(foreign_pose(picture, np.array(turn, dtype=float), np.ravel(shift).astype(float)))
-    return Incoming(cameras=tuple(cameras), poses=tuple(poses))
+            turns[picture] = np.array(turn, dtype=float), np.ravel(shift).astype(float)
+    first: dict[str, CameraFile] = {}
+    differing = {one.name for _, one in read if replace(first.setdefault(one.name, one), path=one.path) != one}
+    cameras = {
+        picture: replace(one, name=f"{one.name} {picture}") if one.name in differing else one for picture, one in read
+    }
+    poses = (foreign_pose(picture, *turn, cameras[picture].name) for picture, turn in turns.items())
+    return Incoming(cameras=tuple(cameras.values()), poses=tuple(poses))
 
 
 def write_colmap(block: ImageBlock, options: ExportOptions) -> Written:
@@ -521,7 +531,10 @@ def import_colmap(paths: Sequence[Path], options: ImportOptions) -> Incoming:
         for image in made.images.values():
             if image.has_pose:
                 pose = image.cam_from_world()
-                poses.append(foreign_pose(image_name(image.name), pose.rotation.matrix(), pose.translation))
+                camera_name = f"camera{image.camera_id}"
+                poses.append(
+                    foreign_pose(image_name(image.name), pose.rotation.matrix(), pose.translation, camera_name)
+                )
     poses.sort(key=lambda pose: pose.image)
     notes.append("The exterior orientations are approximations, in the coordinates of that reconstruction.")
     return Incoming(cameras=tuple(cameras), poses=tuple(poses), notes=tuple(notes))

@@ -182,7 +182,9 @@ def write_bingo(block: ImageBlock, options: ExportOptions) -> Written:
         origin = np.zeros(2) if block.camera_file(frame.camera).fiducials else lens.interior[1:]
         x, y = lens.interior[1:] - origin
         point = f"principal point {x:.5f}, {y:.5f} mm"
-        interior[camera] = f"Camera {camera}: c = {lens.interior[0]:.5f} mm, {point}, no distortion."
+        interior[camera] = (
+            f"Camera {camera}: c = {lens.interior[0]:.5f} mm, {point}; the coordinates are free of distortion."
+        )
         refined, found = lens.ideal_from_observed(frame.camera_mm(marks))
         lines = [f"{_word(frame.image)} {camera}"]
         for mark, (x, y), usable in zip(marks, (refined - origin).tolist(), found, strict=True):

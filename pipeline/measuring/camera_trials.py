@@ -286,7 +286,7 @@ def _each(
     layouts: Mapping[Names, FiducialLayout], tried: Callable[[FiducialLayout], Tried], count: Count
 ) -> dict[Names, Tried]:
     tries = dict[Names, Tried]()
-    for done, (names, layout) in enumerate(layouts.items()):
+    for done, (names, layout) in enumerate(layouts.items(), 1):
         count(", ".join(names), done, len(layouts))
         tries[names] = tried(layout)
     return tries
@@ -307,7 +307,7 @@ def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) ->
     # By two digits of these; among equals (layouts with the same corners) the fewest marks first.
     keys = {names: (float(f"{each.answer.expected:.2g}"), len(each.layout.marks)) for names, each in tries.items()}
     ranked = sorted(tries, key=keys.__getitem__)
-    for done, names in enumerate(ranked, len(ranked)):
+    for done, names in enumerate(ranked, 1):
         each, standing = tries[names], [trial for trial in trials if trial.stands_out]
         drawn, expected = len(each.layout.marks), each.answer.expected
         limit = _HOPELESS

@@ -8,7 +8,7 @@ is reported, too."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import cv2
@@ -320,6 +320,38 @@ def _stop_reason(adjustment: Adjustment) -> str:
     return " ".join(causes).rstrip(".")
 
 
+@dataclass(frozen=True)
+class _Solutions:
+    """Solutions of the bare problem of a camera: by the adjustment, converted to OpenCV's model, and by OpenCV."""
+
+    problem: BareProblem
+    solved: Adjustment
+    conversion: Converted
+    opencv: OpenCvCalibration
+
+    @property
+    def camera(self) -> Camera:
+        return self.problem.network.cameras[0]
+
+    @property
+    def has_residuals(self) -> bool:
+        """Whether the residuals are larger than OpenCV's rounding, so that they tell the standard deviations."""
+        return _rms_um(self.solved) > ROUNDINGS * self.opencv.rounding_um
+
+    @cached_property
+    def inseparable(self) -> list[str]:
+        """Radial terms that the observations do not separate."""
+        return self.solved.inseparable(self.camera.name)
+
+    @cached_property
+    def rows(self) -> tuple[ComparedParameter, ...]:
+        """Parameters that are compared: all estimated ones but inseparable terms."""
+        sigma0 = self.solved.sigma0 if self.has_residuals else 1.0
+        names = model_names(self.camera.distortion.family)
+        rows = _rows(names, self.problem.freedom, self.conversion, sigma0, self.opencv)
+        return tuple(row for row in rows if not self.inseparable or row.name not in OPENCV_RADIAL)
+
+
 def _compare(
     adjustment: Adjustment, name: str, pictures: BoardPictures | None, known: dict[str, Any]
 ) -> tuple[Verdict, str]:
@@ -331,20 +363,8 @@ def _compare(
         raise _NotPossible("No image shows enough points for OpenCV: 4 in a plane, 6 otherwise.")
     known |= {"images": len(problem.images), "points": sum(len(image.xyz) for image in problem.images)}
     solved = _solve_without_priors(problem)
-    rms_um = 1e3 * float(np.sqrt((solved.residuals.v_mm**2).sum(axis=1).mean()))  # of the residual of a point
-    sigma_um = 1e3 * problem.sigma_mm
-    known["rms_reseau_um"] = rms_um
-    try:
-        conversion = converted(problem, solved)
-    except AdjustmentError as error:
-        raise _NotPossible(f"OpenCV's model cannot take this lens: {error}") from None
-    refit_um = 1e3 * conversion.residual_mm
-    known["refit_residual_um"] = refit_um
-    if refit_um > LARGEST_REFIT * sigma_um:
-        raise _NotPossible(
-            f"OpenCV's model cannot take this lens: the nearest one is off by {refit_um:.2f} µm, rms over the image, "
-            f"where a coordinate's standard deviation is {sigma_um:.2f} µm."
-        )
+    known["rms_reseau_um"] = rms_um = _rms_um(solved)
+    conversion = _conversion(problem, solved, known)
     is_fisheye = problem.network.cameras[0].distortion.family == FISHEYE
     calibrated = partial(
         calibrate_fisheye if is_fisheye else calibrate, freedom=problem.freedom, start=conversion.parameters
@@ -357,40 +377,64 @@ def _compare(
         raise _NotPossible(
             f"There is nothing to compare: {error}. Take more pictures, or measure more points."
         ) from None
-    sigmas_tell = rms_um > ROUNDINGS * opencv.rounding_um
-    names = model_names(problem.network.cameras[0].distortion.family)
-    rows = _rows(names, problem.freedom, conversion, solved.sigma0 if sigmas_tell else 1.0, opencv)
-    camera = problem.network.cameras[0]
-    together = solved.inseparable(camera.name)
-    rows = tuple(row for row in rows if not together or row.name not in OPENCV_RADIAL)
-    if not rows:
+    solutions = _Solutions(problem, solved, conversion, opencv)
+    if not solutions.rows:
         raise _NotPossible(
-            f"{enumeration(together)} cannot be separated, and nothing else is free: no parameter is left to compare."
+            f"{enumeration(solutions.inseparable)} cannot be separated, and nothing else is free: no parameter is left "
+            "to compare."
         )
-    known |= {"rms_opencv_um": opencv.rms_um, "rows": rows}
+    known |= {"rms_opencv_um": opencv.rms_um, "rows": solutions.rows}
     is_digital = _is_digital(adjustment, problem)
     if pictures is not None and is_digital:
         known["corners_px"] = compare_corners(problem.images, pictures, calibrated)
     if opencv.rms_um > WORSE_RMS * rms_um + ROUNDINGS * opencv.rounding_um:
         raise _NotPossible(
-            f"OpenCV ends in a worse solution, {opencv.rms_um:.2f} µm a point against {rms_um:.2f} µm: it begins every "
-            "image by itself and did not come to the minimum."
+            f"OpenCV ends in a worse solution, {opencv.rms_um:.2f} µm a point against {rms_um:.2f} µm: it "
+            "begins every image by itself and did not come to the minimum."
         )
-    # Pseudo-observations along the valley, which OpenCV has not, make the other standard deviations smaller.
-    verdict, reason = _agreement(rows, sigmas_tell and not together)
-    if verdict == "differs" and _same_model_agrees(problem, conversion, opencv):
-        verdict = "agrees"
-        reason = (
-            "Given the very same model both programs agree. OpenCV's own model is not quite this lens: the refit "
-            f"leaves {refit_um:.3f} µm, which {known['points']} points notice. {reason}"
-        )
-    if verdict == "agrees" and sigmas_tell:
-        verdict, reason = _judge_departure(reason, adjustment, solved, camera)
-    if together:
-        reason += f" {enumeration(together)} cannot be separated: the radial terms are not compared one by one."
+    verdict, reason = _verdict(solutions, adjustment)
     if not is_digital:  # whose pixels may have no size
         reason += f" The residuals are {opencv.rms_um:.2f} µm rms a point in OpenCV, {rms_um:.2f} µm here."
-    return verdict, f"{reason} {_notes(problem, opencv, sigmas_tell)}"
+    return verdict, f"{reason} {_notes(solutions)}"
+
+
+def _rms_um(solved: Adjustment) -> float:
+    """Rms of the residuals of a point."""
+    return 1e3 * float(np.sqrt((solved.residuals.v_mm**2).sum(axis=1).mean()))
+
+
+def _conversion(problem: BareProblem, solved: Adjustment, known: dict[str, Any]) -> Converted:
+    """Convert a solution to OpenCV's model. Raises _NotPossible where that has no such lens."""
+    try:
+        conversion = converted(problem, solved)
+    except AdjustmentError as error:
+        raise _NotPossible(f"OpenCV's model cannot take this lens: {error}") from None
+    sigma_um, refit_um = 1e3 * problem.sigma_mm, 1e3 * conversion.residual_mm
+    known["refit_residual_um"] = refit_um
+    if refit_um > LARGEST_REFIT * sigma_um:
+        raise _NotPossible(
+            f"OpenCV's model cannot take this lens: the nearest one is off by {refit_um:.2f} µm, rms over the image, "
+            f"where a coordinate's standard deviation is {sigma_um:.2f} µm."
+        )
+    return conversion
+
+
+def _verdict(solutions: _Solutions, adjustment: Adjustment) -> tuple[Verdict, str]:
+    """Verdict and reason from the parameters of both programs, then from what priors and weights change."""
+    # Pseudo-observations along the valley, which OpenCV has not, make the other standard deviations smaller.
+    verdict, reason = _agreement(solutions.rows, solutions.has_residuals and not solutions.inseparable)
+    if verdict == "differs" and _same_model_agrees(solutions):
+        verdict, points = "agrees", sum(len(image.xyz) for image in solutions.problem.images)
+        reason = (
+            "Given the very same model both programs agree. OpenCV's own model is not quite this lens: the refit "
+            f"leaves {1e3 * solutions.conversion.residual_mm:.3f} µm, which {points} points notice. {reason}"
+        )
+    if verdict == "agrees" and solutions.has_residuals:
+        verdict, reason = _judge_departure(reason, adjustment, solutions)
+    if solutions.inseparable:
+        terms = enumeration(solutions.inseparable)
+        reason += f" {terms} cannot be separated: the radial terms are not compared one by one."
+    return verdict, reason
 
 
 def _is_digital(adjustment: Adjustment, problem: BareProblem) -> bool:
@@ -434,11 +478,12 @@ def _sigma_ratio(row: ComparedParameter) -> float:
     return larger / smaller if smaller > 0 else np.inf
 
 
-def _same_model_agrees(problem: BareProblem, conversion: Converted, opencv: OpenCvCalibration) -> bool:
+def _same_model_agrees(solutions: _Solutions) -> bool:
     """Whether the adjustment with OpenCV's own distortion gives OpenCV's solution."""
+    problem = solutions.problem
     if problem.network.cameras[0].distortion.family in ("opencv", FISHEYE):
         return False
-    fx, fy, x0, y0, *distortion = conversion.parameters.tolist()
+    fx, fy, x0, y0, *distortion = solutions.conversion.parameters.tolist()
     values = {"c": fy, "x0": x0, "y0": y0, "b1": fx / fy - 1, "b2": 0.0}
     values |= dict(zip(NAMES[4:], distortion, strict=True))
     free = {"c", "x0", "y0", *problem.freedom.distortion}.difference(problem.freedom.held_interior)
@@ -448,16 +493,17 @@ def _same_model_agrees(problem: BareProblem, conversion: Converted, opencv: Open
     solved = adjust(same.network, same.approximations)
     if not solved.converged:
         return False
-    rows = _rows(NAMES, same.freedom, converted(same, solved), solved.sigma0, opencv)
+    rows = _rows(NAMES, same.freedom, converted(same, solved), solved.sigma0, solutions.opencv)
     return all(r.difference_sigmas < SAME_MODEL_DIFFERENCE and _sigma_ratio(r) < SAME_MODEL_SIGMA_RATIO for r in rows)
 
 
-def _judge_departure(reason: str, adjustment: Adjustment, solved: Adjustment, camera: Camera) -> tuple[Verdict, str]:
+def _judge_departure(reason: str, adjustment: Adjustment, solutions: _Solutions) -> tuple[Verdict, str]:
     """Verdict from the agreement on the bare problem and the departures of the full adjustment from it."""
+    solved, camera = solutions.solved, solutions.camera
     departures = {  # in standard deviations of the bare problem
         each.quantity: abs(adjustment.value(each) - solved.value(each)) / solved.sigma(each)
         for each in (Parameter.interior(camera.name, name) for name in sorted(free_parameters(camera)))
-        if solved.sigma(each) > 0 and not (solved.inseparable(camera.name) and each.quantity in OPENCV_RADIAL)
+        if solved.sigma(each) > 0 and not (solutions.inseparable and each.quantity in OPENCV_RADIAL)
     }
     farthest = max(departures, key=lambda name: departures[name])
     sigmas = departures[farthest]
@@ -470,13 +516,14 @@ def _judge_departure(reason: str, adjustment: Adjustment, solved: Adjustment, ca
     return "agrees", reason
 
 
-def _notes(problem: BareProblem, opencv: OpenCvCalibration, sigmas_tell: bool) -> str:
+def _notes(solutions: _Solutions) -> str:
     """Notes on the simplifications of the bare problem."""
+    problem, opencv = solutions.problem, solutions.opencv
     notes = [
         "This checks the adjustment and not the marks: OpenCV is given the same observations. Both take film "
         "transformations and object points as known, so these sigmas hold for that case"
     ]
-    if not sigmas_tell:
+    if not solutions.has_residuals:
         notes.append(
             "the observations leave no more than OpenCV's rounding, so these sigmas are those assumed beforehand"
         )

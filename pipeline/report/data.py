@@ -97,6 +97,7 @@ class ReportData:
     problems, notes : further ones of the caller.
     made_from : fingerprints of the files by name.
     given_by : source of the given fiducial coordinates by camera.
+    stored_adjustment : of adjustment.json, where it is not shown: whether it is of the marks and settings.
     totals : of all frames if these are many; comparator and measurement then hold only the frames shown.
     """
 
@@ -114,6 +115,7 @@ class ReportData:
     made_from: Mapping[str, str] = field(default_factory=dict)
     unit: str = "m"
     given_by: Mapping[str, str] = field(default_factory=dict)
+    stored_adjustment: Literal["none", "current", "stale"] = "none"
     totals: FrameTotals | None = None
 
     @property

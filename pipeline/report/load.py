@@ -26,6 +26,7 @@ from pipeline.report.data import FrameTotals, ReportData, ReportedFrame, Reporte
 from pipeline.report.frame_problems import centers_px
 from pipeline.report.verdict import suspect_rows
 from pipeline.results.adjustment_file import read_adjustment, read_covariance
+from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparator_file import (
     ComparatorPoint,
     describe_decisions,
@@ -298,14 +299,14 @@ def adjusted_data(project: Project, at: At, most_frames: int | None = None) -> R
     if not path.exists():
         return data
     adjustment, covariance, fingerprint = read_adjustment(path), read_covariance(path), hash_file(path)
-    made, not_shown = adjustment.made_from, ""
-    if others := provenance.differing(made, provenance.adjusted_from(project, data.comparator)):
-        what = f"of other {' and '.join(others)} than there are now" if made else "of what it does not say"
-        not_shown = f"{path.name} is {what}: it is not shown."
+    not_shown = ""
+    if others := _other_inputs(project, adjustment, data.comparator):
+        not_shown = f"{path.name} is of {others}: it is not shown."
     elif covariance.adjustment != fingerprint:
         not_shown = f"adjustment.npz goes with another {path.name}: both are not shown."
     if not_shown:
-        return _add_problems(data, ReportedProblem(not_shown, "Run `reseau adjust`."))
+        stale = replace(data, stored_adjustment="stale")
+        return _add_problems(stale, ReportedProblem(not_shown, "Run `reseau adjust`."))
     made_from = {**data.made_from, path.name: fingerprint}
     data = replace(data, adjustment=adjustment, covariance=covariance, made_from=made_from)
     check_path = at(project.check_path)
@@ -317,6 +318,29 @@ def adjusted_data(project: Project, at: At, most_frames: int | None = None) -> R
         what = f"{check_path.name} is of another adjustment: it is not shown."
         return _add_problems(data, ReportedProblem(what, "Run `reseau check`."))
     return replace(data, check=check, made_from={**data.made_from, check_path.name: hash_file(check_path)})
+
+
+def with_stored_adjustment(data: ReportData, project: Project) -> ReportData:
+    """Note whether adjustment.json, which the marks are shown without, is of them; nothing where there is none."""
+    path = project.adjustment_path
+    if not path.exists():
+        return data
+    note = ""
+    try:
+        if others := _other_inputs(project, read_adjustment(path), data.comparator):
+            note = f"{path.name} is of {others}: `reseau run` adjusts again, as `reseau adjust` does."
+    except InputError as error:  # marks that were measured are not lost for it
+        note = str(error)
+    current = f"{path.name} is of these marks and of the present settings."
+    return replace(data, stored_adjustment="stale" if note else "current", notes=(note or current, *data.notes))
+
+
+def _other_inputs(project: Project, adjustment: AdjustmentRecord, marks: Sequence[ComparatorPoint]) -> str:
+    """Inputs in which an adjustment differs from the present ones, in words; "" where it is of these."""
+    if not adjustment.made_from:
+        return "what it does not say"
+    others = provenance.differing(adjustment.made_from, provenance.adjusted_from(project, marks))
+    return f"other {' and '.join(others)} than there are now" if others else ""
 
 
 def _unlike(made: Mapping[str, str], now: Mapping[str, str]) -> Iterator[ReportedProblem]:

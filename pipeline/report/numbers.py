@@ -1,10 +1,12 @@
-"""Formatting of numbers in the report: true minus signs, and only digits that the standard deviation supports."""
+"""Formatting of numbers to the digits that the standard deviation supports: with true minus signs and powers of ten in
+the report, as they are typed in the terminal."""
 
 import math
 from collections.abc import Iterable
 
 NONE = "–"
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_TYPED = str.maketrans("−⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "--0123456789")
 
 
 def fixed(value: float | None, decimals: int = 2, sign: bool = False) -> str:
@@ -55,13 +57,18 @@ def significant(value: float | None, digits: int = 3) -> str:
     return f"{mantissa:.{max(digits, whole)}g}".replace("-", "−") + _times(power)
 
 
+def typed(text: str) -> str:
+    """Number as it is typed into a calculator or a file: -5.991e-6 for −5.991 × 10⁻⁶."""
+    return text.replace(" × 10", "e").translate(_TYPED)
+
+
 def _power(size: float) -> int:
     """Power of ten to write separately; 0 for sizes that are legible without."""
     return 0 if size == 0.0 or 1e-3 <= size < 1e7 else math.floor(math.log10(size))
 
 
 def _scaled(value: float, decimals: int, power: int) -> str:
-    return f"{value:.{decimals}f}".replace("-", "−") + _times(power)
+    return fixed(value, decimals) + _times(power)
 
 
 def _times(power: int) -> str:

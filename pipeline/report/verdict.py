@@ -303,7 +303,7 @@ def _notes(data: ReportData, shots: list[ReportedFrame]) -> Iterator[str]:
     if not data.comparator and not data.measurement and not data.totals:
         yield "No measurement was handed to this report."
     if not data.adjustment:
-        if _observed(data, shots):
+        if data.stored_adjustment == "none" and _observed(data, shots):
             yield "These marks are not adjusted yet: run `reseau run`."
     elif not data.adjustment.converged:
         yield "There is no solution: all values and residuals of this report are those of the last iteration."
@@ -341,7 +341,7 @@ def _notes(data: ReportData, shots: list[ReportedFrame]) -> Iterator[str]:
                 else sum(mark.status is status and mark.kind == kind for frame in shots for mark in frame.marks)
             )
             if number:
-                yield f"{counted(number, *words)} {status} (their reasons stand with the marks)."
+                yield f"{counted(number, *words)} {status}: the report has the reasons."
 
 
 def _unmodelled_notes(data: ReportData, adjustment: AdjustmentRecord) -> Iterator[str]:

@@ -169,52 +169,67 @@ def write_frame(
     ------
     InputError : the file cannot be written.
     """
-    reduced = _Reduced(canvas, channels, dtype)
-    masks: dict[tuple[int, int], NDArray[np.uint8] | bool] = {}  # most tiles are entirely inside or outside
-    clamped = 0
-
-    def tiles() -> Iterator[Samples]:
-        nonlocal clamped
-        for row0 in range(0, canvas.height_px, TILE_PX):
-            for col0 in range(0, canvas.width_px, TILE_PX):
-                tile = make_tile(col0, row0)
-                clamped += tile.clamped
-                reduced.take(tile.samples, col0, row0)
-                inside = bool(tile.is_inside.flat[0])
-                is_even = bool((tile.is_inside == inside).all())
-                masks[row0, col0] = inside if is_even else np.packbits(tile.is_inside, axis=1)
-                yield tile.samples if channels > 1 else tile.samples[..., 0]
-
-    def masked() -> Iterator[Mask]:
-        for (row0, col0), mask in masks.items():  # in the order of the tiles
-            tile = np.unpackbits(mask, axis=1) if isinstance(mask, np.ndarray) else np.full((TILE_PX,) * 2, mask)
-            part = tile[: canvas.height_px - row0, : canvas.width_px - col0].astype(bool)
-            yield np.pad(part, ((0, TILE_PX - part.shape[0]), (0, TILE_PX - part.shape[1])))
-
-    pages = reduced.count
+    frame = _FrameTiles(canvas, channels, dtype, make_tile)
     size = canvas.width_px * canvas.height_px * channels * np.dtype(dtype).itemsize
-    shape = (canvas.height_px, canvas.width_px, *([channels] if channels > 1 else []))
+    with atomic_path(path) as temporary, TiffWriter(temporary, bigtiff=size > _CLASSIC_BYTES) as file:
+        _write_pages(file, frame, description)
+    return frame.clamped
+
+
+def _write_pages(file: TiffWriter, frame: "_FrameTiles", description: Mapping[str, object]) -> None:
+    """Write the page of a frame, its reduced pages, and the mask of what the scan shows."""
+    canvas, is_color = frame.canvas, frame.channels > 1
+    shape = (canvas.height_px, canvas.width_px, *([frame.channels] if is_color else []))
     per_cm = 10.0 / canvas.pitch_mm
     place = {"x_mm": canvas.x_mm, "y_mm": canvas.y_mm, "pitch_mm": canvas.pitch_mm}
-    options: dict[str, Any] = {"compression": "zlib", "photometric": "rgb" if channels > 1 else "minisblack"}
+    options: dict[str, Any] = {"compression": "zlib", "photometric": "rgb" if is_color else "minisblack"}
     options |= {"tile": (TILE_PX, TILE_PX), "metadata": None, "resolutionunit": "CENTIMETER"}
-    with atomic_path(path) as temporary, TiffWriter(temporary, bigtiff=size > _CLASSIC_BYTES) as file:
-        file.write(
-            tiles(),
-            shape=shape,
-            dtype=dtype,
-            predictor=True,
-            subifds=pages,
-            resolution=(per_cm, per_cm),
-            description=json.dumps({"reseau": version("reseau"), **place, **description}),
-            **options,
-        )
-        for factor, page in reduced.pages():
-            scale = (per_cm / factor, per_cm / factor)
-            file.write(page, predictor=True, subfiletype=_REDUCED, resolution=scale, **options)
-        options["photometric"] = "minisblack"
-        file.write(masked(), shape=shape[:2], dtype=bool, subfiletype=_MASK, resolution=(per_cm, per_cm), **options)
-    return clamped
+    file.write(
+        frame.tiles(),
+        shape=shape,
+        dtype=frame.dtype,
+        predictor=True,
+        subifds=frame.reduced.count,
+        resolution=(per_cm, per_cm),
+        description=json.dumps({"reseau": version("reseau"), **place, **description}),
+        **options,
+    )
+    for factor, page in frame.reduced.pages():
+        scale = (per_cm / factor, per_cm / factor)
+        file.write(page, predictor=True, subfiletype=_REDUCED, resolution=scale, **options)
+    options["photometric"] = "minisblack"
+    file.write(frame.masks(), shape=shape[:2], dtype=bool, subfiletype=_MASK, resolution=(per_cm, per_cm), **options)
+
+
+class _FrameTiles:
+    """Tiles of a frame as they are written; afterwards its reduced pages, masks and number of clamped samples."""
+
+    def __init__(
+        self, canvas: frame_canvas.Canvas, channels: int, dtype: type, make_tile: Callable[[int, int], Tile]
+    ) -> None:
+        self.canvas, self.channels, self.dtype, self._make_tile = canvas, channels, dtype, make_tile
+        self.reduced = _Reduced(canvas, channels, dtype)
+        self.clamped = 0
+        self._masks: dict[tuple[int, int], NDArray[np.uint8] | bool] = {}  # most tiles are entirely inside or outside
+
+    def tiles(self) -> Iterator[Samples]:
+        """Yield the tiles, row by row."""
+        for row0 in range(0, self.canvas.height_px, TILE_PX):
+            for col0 in range(0, self.canvas.width_px, TILE_PX):
+                tile = self._make_tile(col0, row0)
+                self.clamped += tile.clamped
+                self.reduced.take(tile.samples, col0, row0)
+                inside = bool(tile.is_inside.flat[0])
+                is_even = bool((tile.is_inside == inside).all())
+                self._masks[row0, col0] = inside if is_even else np.packbits(tile.is_inside, axis=1)
+                yield tile.samples if self.channels > 1 else tile.samples[..., 0]
+
+    def masks(self) -> Iterator[Mask]:
+        """Yield the masks of the tiles, in their order."""
+        for (row0, col0), mask in self._masks.items():
+            tile = np.unpackbits(mask, axis=1) if isinstance(mask, np.ndarray) else np.full((TILE_PX,) * 2, mask)
+            part = tile[: self.canvas.height_px - row0, : self.canvas.width_px - col0].astype(bool)
+            yield np.pad(part, ((0, TILE_PX - part.shape[0]), (0, TILE_PX - part.shape[1])))
 
 
 class _Reduced:

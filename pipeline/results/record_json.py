@@ -113,7 +113,7 @@ class WithRest:
 
 def json_text(record: object, ensure_ascii: bool = False) -> Iterator[str]:
     """Yield a record as JSON in pieces: a large result as one string takes several times as much memory."""
-    encoder = json.JSONEncoder(indent=1, ensure_ascii=ensure_ascii, allow_nan=False, default=_content)
+    encoder = json.JSONEncoder(indent=1, ensure_ascii=ensure_ascii, allow_nan=False, default=record_content)
     parts = encoder.iterencode(_plain(record))
     while some := "".join(islice(parts, _AT_A_TIME)):
         yield some
@@ -123,11 +123,6 @@ def json_text(record: object, ensure_ascii: bool = False) -> Iterator[str]:
 def write_record(record: object, path: Path) -> None:
     """Write a record to a file. Raises WriteError if that fails."""
     write_atomically(path, "".join(json_text(record)))
-
-
-def plain_json(record: object) -> Any:
-    """Convert a record to dicts, lists, strings and numbers."""
-    return json.loads("".join(json_text(record)))
 
 
 def record_from(kind: type[Record], source: object, **changes: object) -> Record:
@@ -197,7 +192,7 @@ def _required(kind: Any) -> Any:
     return kind
 
 
-def _content(record: object) -> dict[str, Any]:
+def record_content(record: object) -> dict[str, Any]:
     """Keys and values of a record; nested records are not converted."""
     content: dict[str, Any] = {}
     kind: Any = type(record)
@@ -225,7 +220,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Parameter):
         return value.text
     if hasattr(value, "_fields"):
-        return _content(value)
+        return record_content(value)
     if isinstance(value, np.ndarray):
         return _plain(value.tolist())
     return [_plain(item) for item in value] if isinstance(value, list | tuple) else value

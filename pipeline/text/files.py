@@ -111,7 +111,7 @@ def writing(told: Path) -> Iterator[None]:
         named = Path(error.filename)
         file = next(each for each in (named, *named.parents) if each.exists())
         raise WriteError(
-            f"{told}: cannot be written: {file} is a file, and a folder is needed there. Set another output."
+            f"{told}: cannot be written: {file} is a file, and a folder is needed there. Name another folder."
         ) from error
     except OSError as error:
         raise WriteError(
@@ -129,7 +129,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder, with those above it, if it does not exist. Raises WriteError."""
+    """Create a folder, with those above it, if it does not exist. Raises WriteError, also for a file in its place."""
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
 

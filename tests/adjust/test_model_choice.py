@@ -168,6 +168,36 @@ def test_which_of_two_models_is_the_simplest_sufficient(other: model_choice.Cand
     assert model_choice.simplest_sufficient([BROKEN]) is None
 
 
+def test_of_films_with_as_many_unknowns_the_one_with_a_cause_is_taken_unless_another_is_decisively_better() -> None:
+    for vpv, is_better in ((299.0, False), (285.0, True)):
+        projective, bilinear = (
+            replace(candidate("k3", vpv, sigmas), model=model_choice.Model(film, "torlegard", ("k3",)))
+            for film, vpv, sigmas in (("projective", 300.0, 1.0), ("bilinear", vpv, 0.99))
+        )
+        chosen = model_choice.simplest_sufficient([bilinear, projective])
+        assert chosen is (bilinear if is_better else projective)
+        others = model_choice.reasons([projective, bilinear], chosen)[1:]
+        assert [("fits about as well" in text, "Projective is what film" in text) for text in others] == [
+            (not is_better, not is_better)
+        ]
+
+
+def test_reasons_name_the_criterion_that_decided() -> None:
+    chosen = candidate("k3", 300.0, 1.0)
+    others = {
+        "is too simple: what it lacks is significant, F(1, 299) = ": candidate("", 320.0, 1.1),
+        "is not needed: what it adds is not significant, F(1, 298) = 0.997, p = 0.319": candidate("k3 k5", 299.0, 0.9),
+        "predicts points left out no better than the selected one (1.01 and 1": candidate("k3 k5", 280.0, 1.01),
+        "but cannot be tested on points left out.": candidate("k3 k5", 280.0, None),
+        "with 9 more unknowns, fits worse for its unknowns: its AICc is ": candidate(EBNER, 299.0, 0.9, "ebner"),
+        "has no solution: singular. No cause.": replace(BROKEN, model=model_choice.Model("affine", "brown", ("k1",))),
+    }
+    for words, other in others.items():
+        rule, reason = model_choice.reasons([chosen, other], chosen)
+        assert rule == model_choice.RULE
+        assert words in reason, reason
+
+
 def test_akaikes_criteria_in_closed_form() -> None:
     """Of 100 observations, 4 unknowns and v'Pv 90: AIC 98, AICc 100 ln 0.9 + 10 + 60 / 94."""
     each = model_choice.Candidate(model_choice.Model("none"), "", 100, 4, 96, 90.0)

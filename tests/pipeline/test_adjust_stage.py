@@ -537,7 +537,7 @@ def test_a_frame_without_enough_targets_keeps_its_film_transformation(tmp_path: 
     assert list(result["images"]) == ["a"]
     assert {row["kind"] for row in result["residuals"]} == {"fiducial"}
     warnings = " ".join(result["warnings"])
-    assert "Image 'a' is not oriented: it shows 1 targets and needs 3." in warnings
+    assert "Image 'a' is not oriented: it shows 1 target and needs 3." in warnings
     assert "Image 'b' has no part in the adjustment" in warnings
     assert result["cameras"]["K"]["principal_distance_mm"]["value"] == 153.0
     assert result["cameras"]["K"]["principal_distance_mm"]["sigma"] is None

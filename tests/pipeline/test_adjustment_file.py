@@ -17,12 +17,17 @@ from pipeline import InputError, read_adjustment, write_adjustment
 from pipeline.results import adjustment_content, stage_files
 from pipeline.results.adjustment_file import covariance_path, read_covariance
 from pipeline.results.adjustment_record import Quantity
-from pipeline.results.record_json import plain_json
+from pipeline.results.record_json import json_text
 
 
 @pytest.fixture
 def adjustment() -> Adjustment:
     return made_up_calibration.adjustment()
+
+
+def plain_json(record: object) -> Any:
+    """What a file would hold."""
+    return json.loads("".join(json_text(record)))
 
 
 @pytest.fixture

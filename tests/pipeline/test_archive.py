@@ -314,7 +314,7 @@ def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(tmp_path: Path, caps
     measured.clear()
     measure(folder)
     assert not measured
-    assert "2 of 2 scans measured (2 in earlier runs)" in capsys.readouterr().err
+    assert "2 of 2 scans measured (2 stored already)" in capsys.readouterr().err
     one_more(folder)
     (folder / "a.tif").unlink()
     measure(folder)

@@ -31,6 +31,8 @@ from studies import parametrize_with_studies
 
 from pipeline.archive.verdicts import Verdict
 from pipeline.commands.shared import command_step, print_next, summary_steps
+from pipeline.errors import InputError
+from pipeline.exchange.exchange_stage import check_folder
 from pipeline.progress import Reporter, time_left
 from pipeline.report.verdict import ReportVerdict
 from pipeline.summary import Summary
@@ -188,6 +190,9 @@ def test_a_file_in_place_of_a_folder_is_named(tmp_path: Path, refusal: Refusal) 
     words = f"{scene} is a file, and a folder is needed there"
     assert words in refusal("render", scene, scene)
     assert words in refusal("render", scene, scene / "below")
+    assert words in refusal("demo", scene)
+    with pytest.raises(InputError, match="is a file, and a folder is needed there"):
+        check_folder(scene)  # of an export or import
 
 
 def pixels_for_mm(rows: list[str]) -> list[str]:

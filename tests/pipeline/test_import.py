@@ -103,6 +103,23 @@ def test_poses_and_cameras_come_back_as_they_went(format: str, project: Path, tm
     assert camera.principal_point_mm == pytest.approx(point, abs=1e-9)
 
 
+@pytest.mark.parametrize("format", ["opencv", "colmap"])
+def test_cameras_of_rectified_frames_come_back_together(format: str, project: Path, tmp_path: Path) -> None:
+    """Each frame has a size and origin of its own."""
+    out = exported(project, format, tmp_path, "--lens")
+    folder = imported(format, sorted(out.glob("*.yml")) or [out / "sparse"], tmp_path, *PITCH)
+    images = read_images(folder / "images.csv")
+    assert len(images.exterior) > 1
+    cameras = {image: read_camera(folder / Path(file).name) for image, file in images.camera.items()}
+    assert {Path(file).parent for file in images.camera.values()} == {folder}
+    assert len({camera.name for camera in cameras.values()}) == len(images.exterior)
+    lone = exported(project, "opencv", tmp_path, "--lens")
+    for image, camera in cameras.items():
+        alone = imported("opencv", [lone / f"{image}.yml"], tmp_path / image, *PITCH) / "camera.toml"
+        assert camera.principal_point_mm == pytest.approx(present(read_camera(alone).principal_point_mm), abs=1e-9)
+    assert "from the folder of project.toml" in " ".join((folder / "README.txt").read_text().split())
+
+
 MARK = "<OneMesureAF1I><NamePt>1</NamePt><PtIm>{}</PtIm></OneMesureAF1I>"
 MARKS = f"<MesureAppuiFlottant1Im><NameIm>a</NameIm>{MARK}</MesureAppuiFlottant1Im>"
 PIXELS = "%YAML:1.0\n---\nK: !!opencv-matrix {{rows: 3, cols: 3, dt: d, data: [9, 0, 5, 0, 9, 5, 0, 0, 1]}}\n{}\n"

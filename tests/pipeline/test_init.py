@@ -73,7 +73,9 @@ def box(tmp_path: Path) -> Path:
 
 
 def test_files_are_sorted_into_kinds_copies_and_broken_ones(box: Path, tmp_path: Path) -> None:
-    found = catalogue([box], no_count)
+    counts = list[tuple[str, int, int]]()
+    found = catalogue([box], lambda *shown: counts.append(shown))
+    assert counts == [("", found.files, found.files)]  # never "0 of"
     kinds = {(group.folder.name, group.head.height_px): [path.name for path in group.paths] for group in found.groups}
     assert kinds == {
         ("1952", 60): ["0001.tif", "0002.tif", "0003.tif"],
@@ -301,7 +303,7 @@ def test_a_folder_is_measured(drawn_library: Path, capsys: Capture, monkeypatch:
     assert command("run", drawn_library, "--json", "--workers", "1") in (0, 1)  # the project that stands there
     again = capsys.readouterr()
     assert set(json.loads(again.out)["frames"]) == {"a"}
-    assert "1 of 1 scan measured (1 in earlier runs)" in again.err
+    assert "1 of 1 scan measured (1 stored already)" in again.err
 
 
 def test_photographs_alone_are_refused(tmp_path: Path, refusal: Refusal) -> None:

@@ -507,7 +507,7 @@ def test_credentials_stay_secret(local: Path, tmp_path: Path, monkeypatch: pytes
     """By two processes, which are given them. Another signature is the same scan; a wrong one is told without it."""
     monkeypatch.setattr(remote, "_WAITS_S", (0.01,))
     with range_server(local) as server:
-        for signature, left in (("s3cr3t1", "2 to go"), ("s3cr3t2", "2 in earlier runs"), ("s3cr3t3", "")):
+        for signature, left in (("s3cr3t1", "2 to go"), ("s3cr3t2", "2 stored already"), ("s3cr3t3", "")):
             server.signature = "s3cr3t2" if signature == "s3cr3t3" else signature
             url, query = server.url.replace("://", "://ann:hunter2@"), f"X-Amz-Date=1&X-Amz-Signature={signature}"
             folder = write_scan_project(tmp_path / "p", f'"{url}/a.tif?{query}", "{url}/b.tif?{query}"')

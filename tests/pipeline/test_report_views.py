@@ -26,7 +26,7 @@ from pipeline.report.fiducials import Figure, figure_of_films, figure_plot
 from pipeline.report.frame_views import SIZE_PX, mark_picture
 from pipeline.report.lens import curves_plot, lens, lens_map
 from pipeline.report.load import report_data
-from pipeline.report.numbers import value_and_sigma
+from pipeline.report.numbers import typed, value_and_sigma
 from pipeline.report.parameters import parameter_rows
 from pipeline.report.plots import calibrated_cameras
 from pipeline.results.adjustment_file import ParameterCovariance
@@ -57,6 +57,12 @@ RESIDUAL = ResidualRecord("f1", "7", "target", *[0.0] * 16)
 )
 def test_digits_follow_the_sigma(value: float | None, sigma: float | None, printed: tuple[str, str]) -> None:
     assert value_and_sigma(value, sigma) == printed
+
+
+def test_numbers_in_the_terminal_can_be_typed_into_a_calculator() -> None:
+    assert list(map(typed, value_and_sigma(-1.7427e-7, 3.1e-9))) == ["-1.743e-7", "0.031e-7"]
+    assert typed("1.5 × 10¹²") == "1.5e12"
+    assert value_and_sigma(-1e-9, 2e-6, 1e-6)[0] == "0.0 × 10⁻⁶"  # no minus sign before a zero
 
 
 def test_ticks_are_round_and_names_sort_by_their_numbers() -> None:

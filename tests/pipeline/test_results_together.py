@@ -21,6 +21,7 @@ import pytest
 from in_process import Loses, wait_until
 from projects import (
     Capture,
+    Printed,
     Refusal,
     Spoil,
     change_camera,
@@ -77,6 +78,24 @@ def test_a_finished_project_is_current(finished: tuple[Path, int]) -> None:
     assert not [name for name in os.listdir(project / "out") if name.startswith(".")]
 
 
+def test_measuring_again_says_whether_the_adjustment_is_of_the_marks(project: Path, printed_line: Printed) -> None:
+    def of_measure() -> str:
+        return printed_line("measure", project / "project.toml")
+
+    text = of_measure()
+    assert "adjustment.json is of these marks and of the present settings." in text
+    assert "Next: reseau report" in text
+    robust(project)
+    text = of_measure()
+    assert "adjustment.json is of other settings than there are now: `reseau run` adjusts again" in text
+    assert "Next: reseau run" in text
+    path = project / "out" / "adjustment.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "iterations": "many"}))
+    assert "adjustment.json: iterations" in of_measure()  # and the marks are written nevertheless
+    path.unlink()
+    assert "These marks are not adjusted yet: run `reseau run`." in of_measure()
+
+
 def test_an_adjustment_of_one_scan_less_is_not_shown(project: Path, capsys: Capture) -> None:
     """As `reseau measure` leaves the files."""
     path = project / "out" / "measurement.db"
@@ -90,6 +109,7 @@ def test_an_adjustment_of_one_scan_less_is_not_shown(project: Path, capsys: Capt
     assert code == 1
     assert own_summary["sentence"].startswith("Measured: ")
     assert own_summary["adjustment"] is own_summary["check"] is None
+    assert not any("not adjusted yet" in note for note in own_summary["notes"])
     assert "adjustment.json is of other marks than there are now: it is not shown." in join_problems(own_summary)
     assert "Calibrated" not in (project / "out" / "report.html").read_text()
 

@@ -114,7 +114,7 @@ function fitted() {
   const blurs = fits.map(({ id, blur_px: blur }) => `${id}: ${blur.toFixed(2)} px`);
   const lost = reply.marks.filter(({ unfitted }) => unfitted).map(({ id, unfitted }) => ` Not mark ${id}: ${unfitted}.`);
   const remedy = lost.length ? " Look at these, and click them again or take them out." : "";
-  return `Fitted: turned by ${fits[0].turn_deg.toFixed(2)}°; blur of mark ${blurs.join(", ")}.${lost.join("")}${remedy}`;
+  return `Fitted: turned by ${fits[0].turn_deg.toFixed(2).replace("-", "−")}°; blur of mark ${blurs.join(", ")}.${lost.join("")}${remedy}`;
 }
 
 function look(shown) {
@@ -173,7 +173,7 @@ function showForm() {
       input.id = `size-${key}`;
       input.value = value;
       label.title = meaning;
-      label.append(`${key.replace(/_(mm|deg)$/, "").replaceAll("_", " ")} `, input, unit ? ` ${unit}` : "");
+      label.append(`${key.replace(/_(mm|deg)$/, "").replace("_", " ").replaceAll("_", " ")} `, input, unit ? ` ${unit}` : "");
       input.addEventListener("change", () => {
         const given = choices.length ? input.value : Number(input.value);
         input.blur();
@@ -282,7 +282,7 @@ function drawMark(pen) {
     pen.strokeStyle = "#000";
     pen.stroke();
     if (drag?.key === key || (handles.length < 8 && isFree)) {
-      view.name(pen, px, key.split(".").at(-1).replace(/_(mm|deg)$/, ""), COLOUR.handle);
+      view.name(pen, px, key.split(".").at(-1).replace(/_(mm|deg)$/, "").replace("_", " "), COLOUR.handle);
       named.push([x, y]);
     }
   }

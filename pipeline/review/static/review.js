@@ -265,14 +265,21 @@ function ellipse(mark, zoom) {
   });
 }
 
+const FIGURES = {
+  snr: "signal-to-noise ratio",
+  likeness: "correlation with the drawing",
+  damaged_fraction: "damaged fraction",
+  second_method_sigmas: "second method, standard deviations off",
+};
+
 function showFacts(mark) {
   const facts = [["status", mark.status], ["camera", mark.camera], ["verdict of the scan", mark.verdict]];
-  if (mark.center) facts.push(["column, row", mark.center.map((value) => value.toFixed(2)).join(", ")]);
-  if (mark.covariance) facts.push(["sigmas", `${[0, 1].map((k) => Math.sqrt(mark.covariance[k][k]).toFixed(3)).join(", ")} px`]);
+  if (mark.center) facts.push(["column, row", `${mark.center.map((value) => value.toFixed(2)).join(", ")} px`]);
+  if (mark.covariance) facts.push(["standard deviations", `${[0, 1].map((k) => Math.sqrt(mark.covariance[k][k]).toFixed(3)).join(", ")} px`]);
   const parts = mark.causes.filter(({ sigma_px: sigma }) => sigma >= 0.0005); // half of the last digit
   for (const { cause, sigma_px: sigma } of parts.slice(0, 5)) facts.push([`of which ${cause}`, `${sigma.toFixed(3)} px`]);
-  for (const name of ["snr", "likeness", "damaged_fraction", "second_method_sigmas"]) {
-    if (name in mark.quality) facts.push([name.replaceAll("_", " "), mark.quality[name].toPrecision(3)]);
+  for (const [name, words] of Object.entries(FIGURES)) {
+    if (name in mark.quality) facts.push([words, mark.quality[name].toPrecision(3)]);
   }
   by("facts").replaceChildren(
     ...facts.flatMap(([name, value]) => {
