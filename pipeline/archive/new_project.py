@@ -231,7 +231,7 @@ def project_text(new: NewProject) -> str:
         given, reason = ", ".join(map(str, new.given)), next(iter(new.found.unread.values()), "")
         raise InputError(f"{given}: of {counted(new.found.files, 'file')} none can be read as a scan. {reason}".strip())
     ((usual, count),) = Counter(cameras.values()).most_common(1)
-    camera = f"camera = {quoted(PREFIX + usual)}    # of {count} scans; images.csv has each one's own"
+    camera = f"camera = {quoted(PREFIX + usual)}    # of {counted(count, 'scan')}; images.csv has each one's own"
     if not usual:
         camera = f'# camera = "camera.toml"    # draw it: {TEMPLATE_COMMAND}'
     excluded = list[str]()
@@ -278,7 +278,7 @@ def print_new_project(new: NewProject, console: Console) -> None:
                 say(f"    and {len(cases) - _SHOWN} more; --json lists all")
     for note in new.notes():
         say(note)
-    say(f"Written: {new.folder / 'project.toml'}, {new.folder / 'images.csv'} ({len(new.cameras)} scans).")
+    say(f"Written: {new.folder / 'project.toml'}, {new.folder / 'images.csv'} ({counted(len(new.cameras), 'scan')}).")
 
 
 def _left_out(found: scan_groups.Catalogue) -> dict[str, list[Path]]:

@@ -189,12 +189,12 @@ def _write_pages(file: TiffWriter, frame: "_FrameTiles", description: Mapping[st
         shape=shape,
         dtype=frame.dtype,
         predictor=True,
-        subifds=frame.reduced.count,
+        subifds=frame.pages,
         resolution=(per_cm, per_cm),
         description=json.dumps({"reseau": version("reseau"), **place, **description}),
         **options,
     )
-    for factor, page in frame.reduced.pages():
+    for factor, page in frame.reduced_pages():
         scale = (per_cm / factor, per_cm / factor)
         file.write(page, predictor=True, subfiletype=_REDUCED, resolution=scale, **options)
     options["photometric"] = "minisblack"
@@ -202,15 +202,24 @@ def _write_pages(file: TiffWriter, frame: "_FrameTiles", description: Mapping[st
 
 
 class _FrameTiles:
-    """Tiles of a frame as they are written; afterwards its reduced pages, masks and number of clamped samples."""
+    """Tiles of a frame as they are written; afterwards its masks, reduced pages and number of clamped samples."""
 
     def __init__(
         self, canvas: frame_canvas.Canvas, channels: int, dtype: type, make_tile: Callable[[int, int], Tile]
     ) -> None:
         self.canvas, self.channels, self.dtype, self._make_tile = canvas, channels, dtype, make_tile
-        self.reduced = _Reduced(canvas, channels, dtype)
         self.clamped = 0
         self._masks: dict[tuple[int, int], NDArray[np.uint8] | bool] = {}  # most tiles are entirely inside or outside
+        self._factor = _REDUCTION
+        pixel_bytes = channels * np.dtype(dtype).itemsize
+        while canvas.width_px * canvas.height_px * pixel_bytes / self._factor**2 > _LARGEST_REDUCED_BYTES:
+            self._factor *= 2
+        shape = (-(-canvas.height_px // self._factor), -(-canvas.width_px // self._factor), channels)
+        self._first: Samples = np.zeros(shape, dtype)  # the first reduced page
+        larger = max(canvas.width_px, canvas.height_px)
+        self.pages = 1
+        while larger / (self._factor * _REDUCTION**self.pages) >= _SMALLEST_PX:
+            self.pages += 1
 
     def tiles(self) -> Iterator[Samples]:
         """Yield the tiles, row by row."""
@@ -218,11 +227,20 @@ class _FrameTiles:
             for col0 in range(0, self.canvas.width_px, TILE_PX):
                 tile = self._make_tile(col0, row0)
                 self.clamped += tile.clamped
-                self.reduced.take(tile.samples, col0, row0)
+                small = _averaged(tile.samples, self._factor)
+                part = self._first[row0 // self._factor :, col0 // self._factor :][: small.shape[0], : small.shape[1]]
+                part[:] = small[: part.shape[0], : part.shape[1]]
                 inside = bool(tile.is_inside.flat[0])
                 is_even = bool((tile.is_inside == inside).all())
                 self._masks[row0, col0] = inside if is_even else np.packbits(tile.is_inside, axis=1)
                 yield tile.samples if self.channels > 1 else tile.samples[..., 0]
+
+    def reduced_pages(self) -> Iterator[tuple[int, Samples]]:
+        """Yield factors and reduced pages by area averaging: of the tiles, then each of the page before it."""
+        page: Samples = self._first
+        for level in range(self.pages):
+            yield self._factor * _REDUCTION**level, page if page.shape[2] > 1 else page[..., 0]
+            page = _averaged(page, _REDUCTION)
 
     def masks(self) -> Iterator[Mask]:
         """Yield the masks of the tiles, in their order."""
@@ -230,33 +248,6 @@ class _FrameTiles:
             tile = np.unpackbits(mask, axis=1) if isinstance(mask, np.ndarray) else np.full((TILE_PX,) * 2, mask)
             part = tile[: self.canvas.height_px - row0, : self.canvas.width_px - col0].astype(bool)
             yield np.pad(part, ((0, TILE_PX - part.shape[0]), (0, TILE_PX - part.shape[1])))
-
-
-class _Reduced:
-    """Reduced pages by area averaging: the first one from the tiles, each other one from the page before it."""
-
-    def __init__(self, canvas: frame_canvas.Canvas, channels: int, dtype: type) -> None:
-        self.factor = _REDUCTION
-        pixel_bytes = channels * np.dtype(dtype).itemsize
-        while canvas.width_px * canvas.height_px * pixel_bytes / self.factor**2 > _LARGEST_REDUCED_BYTES:
-            self.factor *= 2
-        shape = (-(-canvas.height_px // self.factor), -(-canvas.width_px // self.factor), channels)
-        self.first: Samples = np.zeros(shape, dtype)
-        larger = max(canvas.width_px, canvas.height_px)
-        self.count = 0
-        while larger / (self.factor * _REDUCTION**self.count) >= _SMALLEST_PX or self.count == 0:
-            self.count += 1
-
-    def take(self, samples: Samples, col0: int, row0: int) -> None:
-        small = _averaged(samples, self.factor)
-        part = self.first[row0 // self.factor :, col0 // self.factor :][: small.shape[0], : small.shape[1]]
-        part[:] = small[: part.shape[0], : part.shape[1]]
-
-    def pages(self) -> Iterator[tuple[int, Samples]]:
-        page: Samples = self.first
-        for level in range(self.count):
-            yield self.factor * _REDUCTION**level, page if page.shape[2] > 1 else page[..., 0]
-            page = _averaged(page, _REDUCTION)
 
 
 def _averaged(samples: Samples, factor: int) -> Samples:

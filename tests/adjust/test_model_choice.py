@@ -182,6 +182,16 @@ def test_of_films_with_as_many_unknowns_the_one_with_a_cause_is_taken_unless_ano
         ]
 
 
+@pytest.mark.parametrize("film", ["projective", "bilinear"])
+def test_an_adjustment_with_too_simple_a_film_advises_the_one_that_made_it(film: Transformation) -> None:
+    network = nets.set_images(make_network(2, "none", "affine", points=16), transformation="affine")
+    xy = network.observations.xy_mm.copy()
+    sign = np.where(network.image_numbers % 2, 1.0, -1.0)[:, None]
+    bent = 3e-6 * sign * xy[:, :1] * (xy if film == "projective" else xy[:, 1:])
+    explanations = adjust(nets.set_observations(network, xy_mm=xy + bent), approximate(network)).explanations
+    assert f'transformation = "{film}"' in explanations[0].remedy
+
+
 def test_reasons_name_the_criterion_that_decided() -> None:
     chosen = candidate("k3", 300.0, 1.0)
     others = {
