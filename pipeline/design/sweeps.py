@@ -203,7 +203,8 @@ def sweep(scene: Variations, number: int, planned: Sweep, progress: Progress = l
     """Carry out a sweep. number: of the sweep in the scene, for messages. Raises InputError for an unknown quantity."""
     varied = [scene.varied(number, planned, value) for value in planned.values]
     steps = []
-    for done, (value, variation) in enumerate(zip(planned.values, varied, strict=True), 1):
+    for done, variation in enumerate(varied, 1):
+        value: float | str = planned.values[done - 1]
         progress(f"{planned.quantity} = {value}", done, len(varied))
         first = expect(variation.setup())
         adjustment = first.plan.adjustment

@@ -91,7 +91,7 @@ def test_measuring_again_says_whether_the_adjustment_is_of_the_marks(project: Pa
     assert "Next: reseau run" in text
     path = project / "out" / "adjustment.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "iterations": "many"}))
-    assert "adjustment.json: iterations" in of_measure()  # and the marks are written nevertheless
+    assert "iterations is 'many'; it should be a whole number" in of_measure()  # and the marks are written nevertheless
     path.unlink()
     assert "These marks are not adjusted yet: run `reseau run`." in of_measure()
 

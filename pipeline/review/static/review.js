@@ -265,11 +265,11 @@ function ellipse(mark, zoom) {
   });
 }
 
-const FIGURES = {
-  snr: "signal-to-noise ratio",
-  likeness: "correlation with the drawing",
-  damaged_fraction: "damaged fraction",
-  second_method_sigmas: "second method, standard deviations off",
+const FIGURES = { // [words, unit]
+  snr: ["signal-to-noise ratio", ""],
+  likeness: ["correlation", ""],
+  damaged_fraction: ["damaged fraction", ""],
+  second_method_sigmas: ["second method", " σ off"],
 };
 
 function showFacts(mark) {
@@ -278,8 +278,8 @@ function showFacts(mark) {
   if (mark.covariance) facts.push(["standard deviations", `${[0, 1].map((k) => Math.sqrt(mark.covariance[k][k]).toFixed(3)).join(", ")} px`]);
   const parts = mark.causes.filter(({ sigma_px: sigma }) => sigma >= 0.0005); // half of the last digit
   for (const { cause, sigma_px: sigma } of parts.slice(0, 5)) facts.push([`of which ${cause}`, `${sigma.toFixed(3)} px`]);
-  for (const [name, words] of Object.entries(FIGURES)) {
-    if (name in mark.quality) facts.push([words, mark.quality[name].toPrecision(3)]);
+  for (const [name, [words, unit]] of Object.entries(FIGURES)) {
+    if (name in mark.quality) facts.push([words, mark.quality[name].toPrecision(3) + unit]);
   }
   by("facts").replaceChildren(
     ...facts.flatMap(([name, value]) => {
