@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
 
 from adjust.errors import AdjustmentError, DatumError, NoImageError, UnorientedError
 from adjust.functional_model.lens import Prior
@@ -32,7 +31,7 @@ from adjust.solution.blunder_hypotheses import (
     check_plausibility,
     exchanged_fiducials,
     misnumbered_images,
-    stations_elsewhere,
+    orientations_elsewhere,
 )
 from adjust.solution.coordinate_blunders import CoordinateBlunder, find_coordinate_blunders
 from adjust.solution.options import Datum, Method, Options
@@ -104,7 +103,7 @@ def adjust(
         return check_plausibility(found, solver.trials)
 
 
-def adjust_unmodelled(network: Network, options: Options | None = None) -> Adjustment:
+def adjust_unmodelled(network: Network, options: Options | None = None, pixel_mm: float | None = None) -> Adjustment:
     """Adjust with a standard deviation of unmodelled errors, estimated for each camera.
 
     It is added in quadrature to those of the camera's targets and tie points, such that their v'Pv equals their
@@ -117,6 +116,7 @@ def adjust_unmodelled(network: Network, options: Options | None = None) -> Adjus
     ----------
     network : marks with their standard deviations from image measurement
     options : of each adjustment
+    pixel_mm : side of a pixel of all images, for errors in px; None: they are told in µm
 
     Returns
     -------
@@ -143,8 +143,9 @@ def adjust_unmodelled(network: Network, options: Options | None = None) -> Adjus
     if doubtful:
         refitted = partial(_fit_unmodelled, options=options)
         result = _leave_out_contradicting(network, first, refitted, agrees, several=True)
+    per_mm, unit = (1000.0, "µm") if pixel_mm is None else (1.0 / pixel_mm, "px")
     warnings = (
-        f"Camera {name}: errors of {1000.0 * sigma_mm:.3g} µm are not modelled, one part in "
+        f"Camera {name}: errors of {per_mm * sigma_mm:.3g} {unit} are not modelled, one part in "
         f"{plausible_mm[name] / PLAUSIBLE / sigma_mm:.0f} of the picture's diagonal. Look for pictures that are "
         "blurred or moved, for a wrong size or count of the board, and whether the lens model suits."
         for name, sigma_mm in result.unmodelled_mm.items()
@@ -257,6 +258,10 @@ class _Solver:
 
         if first.termination != "singular":
             found = _leave_out_contradicting(part, first, adjusted, agrees, several=False)
+        # A few images that show something of another shape look like images distorted each in its own way.
+        is_gross = found is first and first.converged and first.sigma0 > WHOLE
+        if is_gross and any(each.kind == "affinities" for each in first.explanations):
+            found = _leave_out_contradicting(part, first, adjusted, agrees, several=True)
         return replace(found, left_out={**left_out, **found.left_out})
 
     def adjust_without_blind(self, part: Network, start: Approximations | None) -> Adjustment:
@@ -318,7 +323,7 @@ class _Solver:
             return result
         if not weighs_anew:
             self._refuse_blunder(network, result)
-        elsewhere = stations_elsewhere(network, result)
+        elsewhere = orientations_elsewhere(network, result)
         return replace(result, remarks=(*result.remarks, elsewhere)) if elsewhere else result
 
     def _refuse_blunder(self, network: Network, given: Adjustment | None) -> None:
@@ -344,7 +349,7 @@ class _Solver:
             raise
         if result.termination not in ("converged", "singular"):
             result = self._begin_anew(network, start, result)
-        if result.termination == "singular" or (result.converged and self.agrees(result)):
+        if result.termination == "singular" or (result.converged and self.trials.agrees(result)):
             return result
         if blunders := self.coordinate_blunders(network, start):
             return replace(result, slips={each.name: each.sentence for each in blunders})
@@ -386,15 +391,11 @@ class _Solver:
             if not now.converged:
                 return result or (_solve(network, numbered, options, doubted, {}) if places else now)
             result, earlier = replace(now, unmet=unmet), found
-            if not places and self.agrees(result):
+            if not places and self.trials.agrees(result):
                 break
             start = replace(result.approximations, points={**start.points, **result.approximations.points})
         assert result is not None
         return result
-
-    def agrees(self, result: Adjustment) -> bool:
-        """Whether v'Pv is not significant."""
-        return result.redundancy < 1 or bool(chdtrc(result.redundancy, result.vpv) > self.options.probabilities.family)
 
     def solve_plainly(self, network: Network, start: Approximations | None) -> Adjustment | None:
         """Adjust a network in a few steps with the weights as given; None where the adjustment cannot start."""
@@ -546,9 +547,11 @@ def _reason(first: Adjustment, last: Adjustment, frames: Sequence[str]) -> str:
         )
     falls = [first.unmodelled_mm[camera] / sigma_mm for camera, sigma_mm in last.unmodelled_mm.items() if sigma_mm]
     times = f": unmodelled errors are {max(falls):.2g} times smaller then" if falls else ""
+    is_observed = any(image.frame in frames and image.is_observed for image in first.network.images)
+    orientation = "a wrong orientation in images.csv, " if is_observed else ""
     return (
-        f"all marks of {who} contradict the other images, which agree without them{times}. Possible are another size, "
-        "pitch, zoom or camera than given, a crop, another print of the board, or wrong point numbers."
+        f"all marks of {who} contradict the other images, which agree without them{times}. Possible are {orientation}"
+        "another size, pitch, zoom or camera than given, a crop, another print of the board, or wrong point numbers."
     )
 
 

@@ -27,6 +27,7 @@ from scipy.special import chdtrc, chdtri
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.lens import Prior
+from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
 from adjust.initial_values.dlt import linear_transformations
 from adjust.problem.camera import Camera
 from adjust.problem.condition_equations import observed_in_camera
@@ -38,6 +39,7 @@ from adjust.solution.result import Adjustment
 TOLERATED = 2.0  # factor on the given standard deviations up to which residuals need no explanation
 CHECKED = 10  # smallest redundancy for an explanation
 NAMED = 5  # images named in a message
+WORST, RARE = 3, 1e-3  # frames of a camera tried with another one; ratio of likelihoods to be exceeded by one trial
 MOST_PAIRS = 15  # pairs of frames tried as exchanged, largest residuals first
 ONE_AXIS = 10.0  # sigma0 that one axis in another unit leaves at least
 CLEARLY = 3.0  # factor by which an explanation must reduce sigma0
@@ -69,6 +71,50 @@ AXES = {  # blunders that mirror the points, and the matrices that correct them
     },
 }
 
+UNIT = "the coordinates of the points are {} for the stations or distances: another unit"
+
+
+def _times_too(factor: float) -> str:
+    """Words on values that a factor corrects."""
+    return f"{max(factor, 1.0 / factor):.4g} times too {'large' if factor < 1.0 else 'small'}"
+
+
+Reading = Callable[[Array], Array]
+ANGLES: dict[str, Reading] = {  # mistakes of the angles of images.csv, and how to read these then
+    **{
+        f"{what} with the other sign": partial(np.multiply, signs)
+        for what, signs in (
+            ("omega", (-1.0, 1.0, 1.0)),
+            ("phi", (1.0, -1.0, 1.0)),
+            ("kappa", (1.0, 1.0, -1.0)),
+            ("all angles", (-1.0, -1.0, -1.0)),
+        )
+    },
+    "omega and phi exchanged": lambda angles: angles[:, [1, 0, 2]],
+    "omega and kappa exchanged": lambda angles: angles[:, [2, 1, 0]],
+    "phi and kappa exchanged": lambda angles: angles[:, [0, 2, 1]],
+    "angles in gon, not degrees": partial(np.multiply, 0.9),
+    "angles in radians, not degrees": partial(np.multiply, 180.0 / np.pi),
+    "angles of the rotation from camera to object": lambda angles: angles_from_rotation(
+        rotation_from_angles(angles).swapaxes(1, 2)
+    ),
+    "angles of a camera with y down and z forward": lambda angles: angles_from_rotation(
+        np.diag([1.0, -1.0, -1.0]) @ rotation_from_angles(angles)
+    ),
+    **{
+        f"kappa {degrees} degrees larger": partial(np.add, (0.0, 0.0, np.radians(degrees)))
+        for degrees in (90, 180, 270)
+    },
+}
+STATIONS: dict[str, Reading] = {  # the same of the stations
+    **{f"{'XYZ'[i]}0 with the other sign": partial(np.multiply, 1.0 - 2.0 * np.eye(3)[i]) for i in range(3)},
+    "X0 and Y0 exchanged": lambda stations: stations[:, [1, 0, 2]],
+    "X0 and Z0 exchanged": lambda stations: stations[:, [2, 1, 0]],
+    "Y0 and Z0 exchanged": lambda stations: stations[:, [0, 2, 1]],
+    **{f"Z0 {factor:.4g} times as large: another unit": partial(np.multiply, (1.0, 1.0, factor)) for factor in FACTORS},
+    **{UNIT.format(_times_too(1.0 / factor)): partial(np.multiply, factor) for factor in FACTORS},
+}
+
 
 @dataclass(frozen=True)
 class Trials:
@@ -85,6 +131,10 @@ class Trials:
         if result is None or result.termination == "singular" or result.redundancy < CHECKED:
             return False
         return bool(chdtrc(result.redundancy, result.vpv / TOLERATED**2) > self.family)
+
+    def agrees(self, result: Adjustment) -> bool:
+        """Whether v'Pv is not significant."""
+        return result.redundancy < 1 or bool(chdtrc(result.redundancy, result.vpv) > self.family)
 
 
 @dataclass(frozen=True)
@@ -115,7 +165,7 @@ def network_hypotheses(network: Network, bare: Network, given: Adjustment | None
     for factor in FACTORS if network.distances else ():
         by = factor * np.eye(3)
         remedy = "Give both in the unit that [object] unit names."
-        yield [NetworkHypothesis(unit_words(factor), _move_points(network, by), remedy, by)]
+        yield [NetworkHypothesis(UNIT.format(_times_too(factor)), _move_points(network, by), remedy, by)]
     is_far = given is None or not given.converged or given.sigma0 > ONE_AXIS
     exchanged, mirrored_images = _exchanged_frames(network, given), _mirrored_images(network)
     heights = _one_axis(network, (2,)) if is_far else ()  # before distances, of which one may do the same
@@ -135,15 +185,6 @@ def _one_axis(network: Network, axes: Sequence[int]) -> Iterator[NetworkHypothes
         by = np.diag(np.where(np.arange(3) == axis, factor, 1.0))
         words = f"{name} of all points is {_times_too(factor)} for {others}: another unit"
         yield NetworkHypothesis(words, _move_points(network, by), moved=by)
-
-
-def unit_words(factor: float) -> str:
-    """Describe points in another unit; factor: multiplies them to correct it."""
-    return f"the coordinates of the points are {_times_too(factor)} for the stations or distances: another unit"
-
-
-def _times_too(factor: float) -> str:
-    return f"{max(factor, 1.0 / factor):.4g} times too {'large' if factor < 1.0 else 'small'}"
 
 
 def _scaled(prior: Prior | None, factor: float) -> Prior | None:
@@ -262,6 +303,54 @@ def _exchanged_frames(network: Network, given: Adjustment | None) -> Iterator[Ne
         )
 
 
+def exchanged_cameras(network: Network, given: Adjustment, trials: Trials) -> str:
+    """Describe frames that fit another camera than that which they name; empty where none does.
+
+    All trials have as many unknowns, so that the fall of v'Pv is twice the logarithm of the likelihood ratio.
+    """
+    if not given.converged or len({image.camera for image in network.images}) < 2 or trials.agrees(given):
+        return ""
+    camera_of = {image.frame: image.camera for image in network.images}
+    numbers = network.frame_numbers[network.image_numbers]
+    variances = np.diagonal(network.observations.covariance_mm2, axis1=1, axis2=2)
+    squares = np.bincount(numbers, (given.residuals.v_mm**2 / variances).sum(axis=1), len(camera_of)).tolist()
+    size = dict(zip(dict.fromkeys(image.frame for image in network.images), squares, strict=True))
+    frames = {
+        camera: sorted((each for each in camera_of if camera_of[each] == camera), key=lambda each: -size[each])
+        for camera in sorted(set(camera_of.values()))
+    }
+    moves = list[dict[str, str]]()
+    for one, other in combinations(frames, 2):
+        if network.camera_by_name[one].fiducials.keys() != network.camera_by_name[other].fiducials.keys():
+            continue
+        worst = frames[one][:WORST], frames[other][:WORST]
+        moves += [{each: other} for each in worst[0]] + [{each: one} for each in worst[1]]
+        moves += [{first: other, second: one} for first, second in product(*worst)]
+        moves.append(dict.fromkeys(frames[one], other) | dict.fromkeys(frames[other], one))
+    found = dict[int, Adjustment]()
+    for number, move in enumerate(moves):
+        images = tuple(replace(each, camera=move.get(each.frame, each.camera)) for each in network.images)
+        result = trials.adjust(replace(network, images=images))
+        if result is not None and result.converged and trials.explains(result):
+            found[number] = result
+    if not found:
+        return ""
+    best = min(found, key=lambda number: found[number].vpv)
+    result, move = found[best], moves[best]
+    fall = (given.vpv - result.vpv) / max(1.0, result.vpv / result.redundancy)
+    if fall < 2.0 * np.log(len(moves) / RARE) or given.vpv - result.vpv < 0.5 * (given.vpv - given.redundancy):
+        return ""
+    if len(move) == len(camera_of):
+        words = f"The cameras {' and '.join(sorted(set(move.values())))} are exchanged for all images"
+    else:
+        each = "; ".join(f"{frame} fits camera {move[frame]}, not {camera_of[frame]}" for frame in sorted(move))
+        words = f"A wrong camera is given for {len(move)} image{'s' * (len(move) > 1)}: {each}"
+    return (
+        f"{words}. Without this σ₀ is {result.sigma0:.2f}; as it stands it is {given.sigma0:.3g}. Correct the column "
+        "camera of images.csv, or what sorts the images by camera."
+    )
+
+
 def blunder_sentence(network: Network, given: Adjustment | None, trials: Trials) -> str:
     """Describe the blunder of a whole network without which all observations agree; empty where there is none.
 
@@ -271,6 +360,8 @@ def blunder_sentence(network: Network, given: Adjustment | None, trials: Trials)
     """
     if given is None:  # perhaps only the given approximations are wrong
         given = trials.adjust(network)
+    if given is not None and (cameras := exchanged_cameras(network, given, trials)):
+        return cameras
     if trials.explains(given):
         return ""
     bare = replace(network, images=tuple(replace(image, exterior=None) for image in network.images))
@@ -278,7 +369,7 @@ def blunder_sentence(network: Network, given: Adjustment | None, trials: Trials)
     if stations:
         alone = trials.adjust(bare)
         if alone is not None and trials.explains(alone):
-            return stations_elsewhere(network, alone)
+            return orientations_elsewhere(network, alone, is_observed=True)
     for alike in network_hypotheses(network, bare, given):
         found = trials.adjust(alike[0].network)
         better = found is not None and (given is None or CLEARLY * found.sigma0 < given.sigma0 or not given.converged)
@@ -339,38 +430,84 @@ def _near(stations: Array, given: Array, depths: Array) -> Mask:
     return np.asarray(np.linalg.norm(stations - given, axis=1) < NEAR * depths)
 
 
-def stations_elsewhere(network: Network, result: Adjustment) -> str:
-    """Explain stations that lie far from where they are given; empty where nothing does.
+def orientations_elsewhere(network: Network, result: Adjustment, is_observed: bool = False) -> str:
+    """Explain orientations that are not as they are given by mistakes of their table; empty where none does.
 
-    Possible causes: another unit, exchanged frames, or mirrored points of a flat field.
+    Possible causes: exchanged names, wrong signs, units or columns of stations or angles, or mirrored points of a flat
+    field. is_observed: whether standard deviations tell that the orientations contradict the images.
     """
-    given = _given_stations(network)
-    if result.termination == "singular" or len(given) < 2 or not network.observed_points:
+    given = {image.name: image.exterior for image in network.images if image.exterior is not None}
+    stations_given = _given_stations(network)
+    if result.termination == "singular" or len(stations_given) < 2 or not network.observed_points:
         return ""
-    names, (stations, depths, places) = list(given), _stations(result, given)
+    names, (stations, depths, places) = list(stations_given), _stations(result, stations_given)
+    rotations = np.array([adjusted_image(result, name).rotation for name in names])
+    angles = np.array([given[name].values[3:] for name in names])
     off = np.flatnonzero(~_near(stations, places, depths))
+    found = list[str]()
+    turned, is_turned = _best_reading(ANGLES, angles, lambda values: _rotation_errors(values, rotations), is_observed)
+    moved, is_moved = _best_reading(
+        STATIONS, places, lambda values: np.linalg.norm(values - stations, axis=1) / depths, is_observed
+    )
     nearest = np.linalg.norm(stations[off, None] - places[off], axis=2).argmin(axis=1) if len(off) else off
     if len(off) > 1 and len(set(nearest)) == len(off) and _near(stations[off], places[off[nearest]], depths[off]).all():
-        return (
-            f"The frames {shortened([names[i] for i in off], NAMED)} each lie where another's orientation is given: "
-            "their names are exchanged, in the scans or in images.csv."
+        # Exchanged names exchange attitudes too.
+        exchanged = _rotation_errors(angles[off[nearest]], rotations[off])
+        is_kept = CLEARLY * np.linalg.norm(_rotation_errors(angles[off], rotations[off])) < np.linalg.norm(exchanged)
+        if not (moved and is_kept):
+            found.append(
+                f"The frames {shortened([names[i] for i in off], NAMED)} each lie where another's orientation is given:"
+                " their names are exchanged, in the scans or in images.csv."
+            )
+            is_own = CLEARLY * np.linalg.norm(exchanged) < np.linalg.norm(_rotation_errors(angles[off], rotations[off]))
+            if is_own or not moved:
+                return found[0]
+            found[0] = f"{found[0][:-1]}; or:"
+    if (is_turned and turned) or (is_moved and moved):
+        words = "; ".join(each for each in (moved, turned) if each)
+        return " ".join(
+            [
+                *found,
+                f"The orientations of all {len(names)} images are not those that the points give, but would be with "
+                f"another reading: {words}. Correct images.csv, or the points.",
+            ]
         )
     if 2 * len(off) <= len(names):
         return ""
-    moved = [(unit_words(factor), factor * stations, factor) for factor in FACTORS]
     points = _points(result)
     middle = points.mean(axis=0)
     _, extents, axes = np.linalg.svd(points - middle, full_matrices=False)
-    if extents[-1] <= FLAT * extents[0]:
-        reflected = stations - 2.0 * np.outer((stations - middle) @ axes[-1], axes[-1])
-        moved += [(words, reflected @ by.T, 1.0) for words, by in AXES.items()]
-    for words, candidate, scale in moved:
-        if _near(candidate, places, scale * depths).all():
+    if extents[-1] > FLAT * extents[0]:
+        return ""
+    reflected = stations - 2.0 * np.outer((stations - middle) @ axes[-1], axes[-1])
+    for words, by in AXES.items():
+        if _near(reflected @ by.T, places, depths).all():
             return (
                 f"By the points the stations lie nowhere near where they are given, but all {len(names)} would with "
                 f"another reading of the points: {words}. Correct the points, or the stations."
             )
     return ""
+
+
+def _rotation_errors(angles: Array, rotations: Array) -> Array:
+    """(n,) rad, angles between given attitudes (n, 3) and rotations (n, 3, 3)."""
+    cosine = (np.einsum("nij,nij->n", rotation_from_angles(angles), rotations) - 1.0) / 2.0
+    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def _best_reading(
+    readings: Mapping[str, Callable[[Array], Array]], given: Array, errors: Callable[[Array], Array], is_observed: bool
+) -> tuple[str, bool]:
+    """The reading of given values (n, 3) that makes the errors of all images CLEARLY smaller; empty where none does.
+
+    Also returns whether the values as given contradict the images.
+    """
+    as_given, trials = np.linalg.norm(errors(given)), {words: errors(read(given)) for words, read in readings.items()}
+    best = min(trials, key=lambda words: float(np.linalg.norm(trials[words])))
+    error = np.linalg.norm(trials[best])
+    alike = [words for words, each in trials.items() if np.linalg.norm(each) < CLEARLY / 2.0 * error]
+    fits = CLEARLY * error < as_given and trials[best].max() < NEAR
+    return " or ".join(alike) if fits else "", bool(is_observed or errors(given).max() > NEAR)
 
 
 def check_plausibility(result: Adjustment, trials: Trials) -> Adjustment:

@@ -290,7 +290,8 @@ def _other_layouts(spec: Layout, read: MarkerReadings) -> Iterator[Layout]:
     layouts = spec, _other_layout(spec)
     swapped: Changes = {"columns": spec.rows, "rows": spec.columns}
     numbered: list[Changes] = [{first_key: first} for first in firsts]
-    for changes in ([{}], [swapped], numbered, [swapped | each for each in numbered]):
+    groups: tuple[list[Changes], ...] = [{}], [swapped], numbered, [swapped | each for each in numbered]
+    for changes in groups:
         yield from (
             replace(layout, **change) for change, layout in product(changes, layouts) if change or layout != spec
         )
@@ -309,9 +310,9 @@ def _of_other_counts(spec: Layout, read: MarkerReadings) -> Iterator[Layout]:
     for columns in sorted(range(spec.fewest, _MOST_COLUMNS), key=lambda each: abs(each - spec.columns)):
         of_rows = columns / (2 if isinstance(spec, CharucoSpec) else 1)
         rows = max(int(np.ceil((max(middles_px) + 1 - first) / of_rows)), spec.fewest)
-        changes: Changes = {"columns": columns, "rows": rows}
+        counts: Changes = {"columns": columns, "rows": rows}
         with suppress(ValueError):  # raised where the dictionary has too few markers
-            other = replace(spec, **changes)
+            other = replace(spec, **counts)
             on_board = _markers(other)
             middles = np.array([on_board[number].mean(axis=0) for number in middles_px])
             _, inside = cv2.findHomography(middles, np.array(list(middles_px.values())), cv2.RANSAC, near_px)

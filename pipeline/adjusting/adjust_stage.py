@@ -95,7 +95,13 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
         target_field.check_spacing(project, target_field.target_field(project))
     network, left_out = build_network(project, marks)
     network, untold = add_scanner_bends(project, network, adjusted)
-    first = adjust_unmodelled(network, options) if project.adjust.unmodelled == "estimate" else adjusted(network)
+    pitch_um = project.pitch_um or project.list_pitch_um
+    is_digital = all(image.transformation == "none" for image in network.images)
+    pixel_mm = float(np.mean(pitch_um)) / 1000.0 if is_digital and pitch_um else None
+    if project.adjust.unmodelled == "estimate":
+        first = adjust_unmodelled(network, options, pixel_mm)
+    else:
+        first = adjusted(network)
     adjustment, uncorrected = first, tuple[str, ...]()
     if project.disk_radius > 0.0:
         adjustment, uncorrected = _correct_eccentricity(project, first, options)

@@ -21,7 +21,7 @@ import tifffile
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from adjust.functional_model.rotation import angles_from_rotation
+from adjust.functional_model.rotation import angles_from_rotation, angles_near
 from adjust.initial_values.model_formation import absolute_orientation
 from adjust.initial_values.pose import intersect
 from adjust.problem.network import Exterior, ObjectPoint
@@ -31,7 +31,7 @@ from pipeline.errors import InputError
 from pipeline.exchange.incoming import Y_DOWN_Z_FORWARD
 from pipeline.exchange.pinhole import COLMAP, import_pycolmap
 from pipeline.files.camera_file import CameraFile
-from pipeline.files.object_files import ELEMENTS, GivenImages
+from pipeline.files.object_files import ELEMENTS, SIGMAS, GivenImages
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
 from pipeline.resampling.canvas import Canvas, FrameChain
@@ -331,11 +331,15 @@ def run_block(
         interior = {picture.image: given_interior(cameras[picture.camera]) for picture in pictures}
         poses = oriented_by_control(found, pictures, marks, project.object_points, interior)
         own = written_block(project, folder, (*marks, *ties), poses)
-    left_out = tuple(sorted({project.image_frame(mark.image) for mark in marks} - set(poses)))
+    exterior = own.given_images.exterior if own.given_images else {}
+    oriented = {project.image_frame(image) for image, each in exterior.items() if each is not None}
+    observed = {project.image_frame(image) for image, each in exterior.items() if _observed(each).any()}
+    left_out = tuple(sorted({project.image_frame(mark.image) for mark in marks} - oriented))
     lines = [
         f"COLMAP oriented {counted(len(found.poses), 'image')}; {counted(len(ties), 'tie mark')} of "
         f"{counted(len({tie.point for tie in ties}), 'point')} are observations now.",
         *([f"not oriented: {', '.join(left_out)}"] if left_out else []),
+        *([f"{counted(len(observed), 'orientation')} of images.csv observed, and adjusted so"] if observed else []),
         *(f"{step}: {duration:.0f} s" for step, duration in seconds.items()),
     ]
     return own, left_out, lines
@@ -357,22 +361,26 @@ def written_block(
     """Write comparator.csv and images.csv of a block, and return the project that uses them."""
     pitches, given = read_pitches(project.comparator), project.given_images or GivenImages({}, {})
     frames = {mark.image: project.image_frame(mark.image) for mark in marks}
-    kept = [mark for mark in marks if mark.kind != "target" or frames[mark.image] in poses]
+    observed = {
+        frames[image]: each for image, each in given.exterior.items() if image in frames and _observed(each).any()
+    }
+    oriented = poses.keys() | {frame for frame, each in observed.items() if _observed(each).all()}
+    kept = [mark for mark in marks if mark.kind != "target" or frames[mark.image] in oriented]
     write_comparator(folder / "comparator.csv", kept, pitches)
     exterior: dict[str, Exterior | None] = {}
     lines = [
-        "# orientations by COLMAP, as approximations",
-        ",".join(("image", *ELEMENTS, "camera", "scanner", "part_of")),
+        "# orientations by COLMAP, as approximations; elements with standard deviations as they were observed",
+        ",".join(("image", *ELEMENTS, *SIGMAS, "camera", "scanner", "part_of")),
     ]
     for image, frame in sorted(frames.items()):
-        if frame not in poses and not given.part_of.get(image):
+        if frame not in oriented and not given.part_of.get(image):
             continue
-        elements = [""] * len(ELEMENTS)
-        if frame in poses:
-            rotation, station = poses[frame]
-            values = np.concatenate([station, angles_from_rotation(rotation)])
-            exterior[image] = Exterior(values)
-            elements = [repr(float(value)) for value in [*values[:3], *np.degrees(values[3:])]]
+        elements = [""] * len(ELEMENTS + SIGMAS)
+        if frame in oriented:
+            exterior[image] = each = _exterior(poses.get(frame), observed.get(frame))
+            to_file = np.array([1.0, 1.0, 1.0, *np.degrees(np.ones(3))])
+            numbers = [*(each.values * to_file).tolist(), *(each.sigmas * to_file).tolist()]
+            elements = ["" if np.isinf(number) else repr(number) for number in numbers]
         columns = (given.camera, given.scanner, given.part_of)
         lines.append(csv_line([image, *elements, *(column.get(image, "") for column in columns)]))
     write_atomically(folder / "images.csv", "\n".join(lines) + "\n")
@@ -384,6 +392,24 @@ def written_block(
         given_images=replace(given, exterior=exterior),
         images_path=folder / "images.csv",
     )
+
+
+def _observed(exterior: Exterior | None) -> Mask:
+    """(6,) mask of the elements with standard deviations."""
+    return np.isfinite(exterior.sigmas) if exterior else np.zeros(len(ELEMENTS), bool)
+
+
+def _exterior(pose: tuple[Array, Array] | None, given: Exterior | None) -> Exterior:
+    """Exterior orientation of a frame: observed elements as given, the others by COLMAP's pose."""
+    if pose is None or given is None:
+        if given is not None:
+            return given
+        assert pose is not None
+        return Exterior(np.concatenate([pose[1], angles_from_rotation(pose[0])]))
+    rotation, station = pose
+    angles = angles_near(rotation, given.values[3:])
+    values = np.concatenate([station + rotation.T @ np.array(given.antenna), angles])
+    return replace(given, values=np.where(_observed(given), given.values, values))
 
 
 @contextmanager

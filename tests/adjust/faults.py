@@ -388,6 +388,48 @@ def exchanged(given: Network, with_fiducials: bool = False, frames: str = "13") 
     return nets.set_observations(given, image=image)
 
 
+def reread(given: Network, read: Callable[[Array], object]) -> Network:
+    """With the orientations (images, 6) of a table that is read otherwise, in place."""
+    exteriors = {image.name: image.exterior for image in given.images if image.exterior is not None}
+    values = np.array([each.values for each in exteriors.values()])
+    read(values)
+    rows = zip(exteriors.items(), values, strict=True)
+    return nets.orient(given, {name: replace(each, values=row) for (name, each), row in rows})
+
+
+def _scale(columns: slice, factor: float) -> Callable[[Network], Network]:
+    def read(values: Array) -> None:
+        values[:, columns] *= factor
+
+    return lambda given: reread(given, read)
+
+
+def _exchange(one: int, other: int) -> Callable[[Network], Network]:
+    def read(values: Array) -> None:
+        values[:, [one, other]] = values[:, [other, one]]
+
+    return lambda given: reread(given, read)
+
+
+def two_cameras(seed: int, apart_mm: float, sigma_mm: float) -> Network:
+    """Four images each of two cameras, A and B, over one field; c and fiducials of B are apart_mm (rms) off A's."""
+    rng = np.random.default_rng([11, seed])
+    points, made = nets.field_points(rng, 18), []
+    for name in "AB":
+        c = 153.0 + apart_mm * (name == "B")
+        moved = tuple(tuple(each) for each in np.array(nets.STATIONS) + rng.normal(0.0, 60.0, (4, 3)))
+        tilted = tuple(tuple(each) for each in np.array(nets.ATTITUDES) + rng.normal(0.0, [0.05, 0.05, 1.5], (4, 3)))
+        truth = replace(nets.Truth(), c=c, stations=moved, attitudes=tilted)
+        usual = dict(nets.FIDUCIALS)
+        if name == "B":
+            nets.FIDUCIALS.update({id_: tuple(rng.normal(xy, apart_mm)) for id_, xy in usual.items()})
+        one, start = nets.simulated(rng, truth, points=points, fiducial_sigma=sigma_mm)
+        nets.FIDUCIALS.update(usual)
+        one = nets.set_camera(one, principal_distance_mm=Prior(c, sigma_mm))
+        made.append(nets.rename_network(one, start, name, str, lambda image, name=name: name + image[1:], str))  # type: ignore[misc]
+    return nets.join_networks(*made)[0]
+
+
 def one_point(given: Network) -> Network:
     return shift_given(given, f"PT.{given.points[0].id}.X", 200.0)
 
@@ -439,6 +481,15 @@ BLUNDERS = {
     "names shifted by a line, approximate orientations": Blunder(
         APPROXIMATE, lambda n: exchanged(n, True, "".join(each.name[1:] for each in n.images)), ("where another's",)
     ),
+    "sign of X0, approximate orientations": Blunder(APPROXIMATE, _scale(slice(0, 1), -1.0), ("X0 with the other",)),
+    "sign of Y0, observed orientations": Blunder(EXACT, _scale(slice(1, 2), -1.0), ("Y0 with the other sign",)),
+    "X0 and Y0 exchanged, approximate orientations": Blunder(APPROXIMATE, _exchange(0, 1), ("X0 and Y0 exchanged",)),
+    "sign of kappa, approximate orientations": Blunder(APPROXIMATE, _scale(slice(5, 6), -1.0), ("kappa with the",)),
+    "omega and phi exchanged, observed orientations": Blunder(EXACT, _exchange(3, 4), ("omega and phi exchanged",)),
+    "gon for degrees, observed orientations": Blunder(EXACT, _scale(slice(3, 6), 10.0 / 9.0), ("angles in gon",)),
+    "sign of all angles, observed orientations": Blunder(EXACT, _scale(slice(3, 6), -1.0), ("all angles with the",)),
+    "Z0 in feet, approximate orientations": Blunder(APPROXIMATE, _scale(slice(2, 3), 3.2808), ("Z0 0.3048 times",)),
+    "stations in feet, observed orientations": Blunder(EXACT, _scale(slice(0, 3), 3.2808), ("3.281 times too small",)),
     "sheared films held rigid": Blunder(
         None,
         lambda n: nets.set_images(n, transformation="similarity"),
@@ -463,7 +514,7 @@ def blunder_sentences(spoilt: Network) -> list[str]:
     return [*causes, *result.warnings, *(f"{each.tested.name} is suspect" for each in result.suspects)]
 
 
-WHOLE = ("exchanged", "wrong", "points down", "times too", "principal distance of camera")
+WHOLE = ("exchanged", "another reading", "wrong", "points down", "times too", "principal distance of camera")
 SINGLE = ("is suspect", "is not where", "swapped")
 
 

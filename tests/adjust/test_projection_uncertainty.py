@@ -262,5 +262,7 @@ def test_what_is_wrong_with_a_picture_is_no_unmodelled_error_that_passes() -> No
 
 def test_an_implausible_one_is_a_warning() -> None:
     """Errors of 5 µm, a part in 800 of the diagonal of 4 mm: no lens leaves so much."""
-    result = adjust_unmodelled(nets.board_network(np.random.default_rng(9), 6, 5e-3, given_mm=1e-4))
-    assert any(re.search(r"are not modelled, one part in [78]\d\d of", warning) for warning in result.warnings)
+    network = nets.board_network(np.random.default_rng(9), 6, 5e-3, given_mm=1e-4)
+    for pixel_mm, size in ((None, r"[45](\.\d+)? µm"), (0.01, r"0\.[45]\d* px")):
+        words = rf"errors of {size} are not modelled, one part in [78]\d\d of"
+        assert any(re.search(words, warning) for warning in adjust_unmodelled(network, pixel_mm=pixel_mm).warnings)

@@ -296,6 +296,34 @@ def test_control_in_either_scan_of_a_frame_places_the_block(tmp_path: Path) -> N
     assert {mark.image for mark in read_comparator(own.comparator) if mark.kind == "target"} <= {"f1l", "f1r"}
 
 
+def test_observed_orientations_of_a_block_stay_observations(tmp_path: Path) -> None:
+    """Their standard deviations had been dropped; the others' elements, and single ones, are COLMAP's."""
+    sigmas = ",".join(f"s{each}" for each in ("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg"))
+    images = [
+        f"image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg,{sigmas}",
+        "f0,10,20,30,1,2,3,0.1,0.1,0.2,,,0.01",
+        "f1,1,2,3,4,5,6,0.5,0.5,0.5,0.1,0.1,0.1",
+        "f2,7,8,9,1,2,3,,,,,,",
+    ]
+    path = projects.write_tables(
+        tmp_path, 'camera = "camera.toml"\n[object]\nimages = "images.csv"', camera='name = "K"', images=images
+    )
+    marks = [replace(mark, image=f"f{i}") for mark in control(1)[0][:1] for i in range(3)]
+    write_comparator(path.with_name("comparator.csv"), marks, {})
+    pose = rotation(0.1, -0.2, 0.3), np.array([100.0, 200.0, 300.0])
+    own = block_stage.written_block(read_project(path), tmp_path / "block", marks, {"f0": pose, "f2": pose})
+    again = read_images(tmp_path / "block" / "images.csv")
+    for exteriors in (again.exterior, projects.present(own.given_images).exterior):
+        first, second, third = (projects.present(exteriors[f"f{i}"]) for i in range(3))
+        np.testing.assert_allclose(first.values, [10, 20, 30, 0.1, -0.2, np.radians(3.0)], rtol=1e-9)
+        np.testing.assert_allclose(first.sigmas, [0.1, 0.1, 0.2, np.inf, np.inf, np.radians(0.01)], rtol=1e-9)
+        np.testing.assert_allclose(second.values[:3], [1, 2, 3])
+        assert np.isfinite(second.sigmas).all()
+        np.testing.assert_allclose(third.values, [100, 200, 300, 0.1, -0.2, 0.3], rtol=1e-9)
+        assert np.isinf(third.sigmas).all()
+    assert {mark.image for mark in read_comparator(own.comparator)} == {"f0", "f1", "f2"}
+
+
 @pytest.mark.study
 def test_pictures_lie_where_the_lattice_says(tmp_path: Path) -> None:
     """A spot of light at a known place of the camera, in a mirrored scan, through resampling into the picture."""
