@@ -22,6 +22,7 @@ from adjust.functional_model.lens import Distortion, Prior
 from adjust.problem.camera import FiducialDistance
 from adjust.quality.lens_uncertainty import balanced_distance
 from measure.marks.shapes import Point
+from pipeline.errors import InputError
 from pipeline.exchange.formats import Convention
 from pipeline.exchange.incoming import ImportOptions, Incoming
 from pipeline.files.camera_file import CameraFile, GivenFiducial, fiducial_distances
@@ -37,6 +38,7 @@ CERTIFICATE = Convention(
 )
 POWERS = (3, 5, 7)
 _ROUNDED_UM = 1.0 / np.sqrt(12.0)  # standard deviation of values rounded to 1 µm
+LARGEST_CONDITION = 1e7  # of the scaled columns: their normal equations have its square
 _CURVE = 400  # samples of the curve whose extremes are balanced
 NUMBERS = Key("list of numbers", numbers)
 
@@ -69,7 +71,10 @@ def import_certificate(paths: Sequence[Path], options: ImportOptions) -> Incomin
         fitted = fit(certificate)
         cameras.append(_camera(certificate, fitted))
         notes += _notes(certificate, fitted)
-        tables[f"{path.stem}-residuals.csv"] = _residuals(certificate, fitted)
+        name = f"{path.stem}-residuals.csv"
+        if name in tables:
+            raise InputError(f"{path}: another certificate has the same file name {path.stem!r}. Rename one of them.")
+        tables[name] = _residuals(certificate, fitted)
     return Incoming(cameras=tuple(cameras), notes=tuple(notes), tables=tables)
 
 
@@ -167,6 +172,13 @@ def fit(certificate: Certificate) -> FittedTable:
     count = max(min(len(POWERS), len(radius) - 2), 0)
     design = np.column_stack([tangent, *(radius**power for power in POWERS[:count])])
     scale = np.linalg.norm(design, axis=0)
+    with np.errstate(invalid="ignore"):
+        is_singular = not np.linalg.cond(design / scale) < LARGEST_CONDITION
+    if is_singular:
+        raise InputError(
+            f"{certificate.name}: no curve can be fitted to this table: its angles or radii lie too close together or "
+            "too far apart, or a radial_um is too large. Look for a misprint."
+        )
     solution = np.linalg.lstsq(design / scale, observed)[0] / scale
     residuals = observed - design @ solution
     redundancy = len(radius) - design.shape[1]

@@ -38,6 +38,8 @@ from pipeline.text.files import read_bytes
 from pipeline.text.wording import did_you_mean, listed
 from pipeline.types import Array
 
+LEAST_R0_MM = 1e-3  # whole numbers of such radii to the seventh power can be computed with
+
 
 @dataclass(frozen=True)
 class ConvertOptions:
@@ -117,8 +119,8 @@ def run_convert(path: Path, folder: Path, options: ConvertOptions) -> Conversion
     unknown = sorted(set(options.parameters) - set(target.parameters))
     if unknown:
         raise InputError(f"{options.family} has no parameter {listed(unknown)}; it has {listed(target.parameters)}.")
-    if target.needs == "r0_mm" and not options.r0_mm > 0.0:
-        raise InputError(f"{options.family} needs a radius r0: say with --r0-mm which.")
+    if target.needs == "r0_mm" and not LEAST_R0_MM <= options.r0_mm < math.inf:
+        raise InputError(f"{options.family} needs a radius r0 of {LEAST_R0_MM:g} mm or more: say with --r0-mm which.")
     check_folder(folder)
     is_adjustment = path.suffix == ".json"
     done = _converted_adjustment(path, options) if is_adjustment else _converted_camera(path, folder, options)

@@ -33,6 +33,7 @@ from pipeline.text.files import file_word, make_folder, path_below, write_atomic
 from pipeline.text.wording import listed
 
 README = "README.txt"
+ROTATION_ERROR = 1e-3  # of R^T R: rotations are written with four decimals or more
 _HEAD = "Written by reseau"
 
 
@@ -74,10 +75,16 @@ def readme(what: str, head: Sequence[str], parts: Mapping[str, Sequence[str]]) -
 
 
 def check_folder(folder: Path) -> None:
-    """Raise InputError for a folder with anything other than an earlier export, which would be overwritten."""
+    """Raise InputError for a folder with anything other than an earlier export, which would be overwritten, and for
+    one that the program runs in."""
     if not folder.exists():
         return
     make_folder(folder)
+    if Path.cwd().is_relative_to(folder.resolve()):
+        raise InputError(
+            f"{folder}: is the folder that reseau runs in, or above it, and the whole folder is replaced. Name "
+            "another, such as export."
+        )
     text = (folder / README).read_bytes() if (folder / README).is_file() else b""
     if any(folder.iterdir()) and not text.startswith(_HEAD.encode()):
         raise InputError(
@@ -86,10 +93,11 @@ def check_folder(folder: Path) -> None:
 
 
 def publish(folder: Path, files: Mapping[str, str | bytes], readme_text: str) -> None:
-    """Write all files into a new folder that then replaces the earlier one.
+    """Write all files into a new folder that then replaces the earlier one, or the one that a symbolic link names.
 
     Raises InputError for file names that lead out of the folder.
     """
+    folder = folder.resolve()
     new = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     old = folder.with_name(f".{folder.name}.{os.getpid()}.old")
     try:
@@ -187,7 +195,16 @@ def _images(poses: Sequence[ForeignPose], cameras: Sequence[Path]) -> str:
     file_of = {path.name: path.as_posix() for path in cameras if len(cameras) > 1}
     columns = ("image", *ELEMENTS, "camera") if file_of else ("image", *ELEMENTS)
     lines = ["# orientations of another program, as approximations", ",".join(columns)]
+    image, most = Counter(pose.image for pose in poses).most_common(1)[0]
+    if most > 1:
+        raise InputError(f"the orientation of image {image!r} is given twice in the files. Name one of them.")
     for pose in poses:
+        turned = np.allclose(pose.rotation.T @ pose.rotation, np.eye(3), atol=ROTATION_ERROR)
+        if not (turned and np.linalg.det(pose.rotation) > 0.0 and np.isfinite(pose.station).all()):
+            raise InputError(
+                f"the orientation of image {pose.image!r} is no rotation matrix with a place of finite numbers. "
+                "Correct it, or leave the file out."
+            )
         angles = np.degrees(angles_from_rotation(pose.rotation))
         camera = [file_of.get(_camera_file(pose.camera), "")] if file_of else []
         lines.append(csv_line([pose.image, *(repr(float(value)) for value in (*pose.station, *angles)), *camera]))

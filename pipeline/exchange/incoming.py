@@ -176,6 +176,8 @@ def opencv_camera(
     if options.pitch_um is None:
         raise InputError(f"{path}: counts in pixels: give the pixel size in µm with --pitch-um.")
     fx, fy, cx, cy = interior_px
+    if not (min(fx, fy) > 0.0 and np.isfinite([*interior_px, *lens.values()]).all()):
+        raise InputError(f"{path}: {name}: focal lengths are to be positive, and all values of the lens finite.")
     pitch = options.pitch_um / 1000.0
     first = np.array(convention.first_pixel_px)
     if options.from_middle:

@@ -261,7 +261,7 @@ def import_micmac(paths: Sequence[Path], options: ImportOptions) -> Incoming:
         for image in images:
             name = image_name(child_text(image, "NameIm", path))
             for point, place, sigma_px in _points(image, path):
-                covariance = None if sigma_px is None else sigma_px**2 * np.eye(2)
+                covariance = sigma_px**2 * np.eye(2) if sigma_px is not None and sigma_px > 0.0 else None
                 marks.append(ForeignMark(name, point, kind, place - MICMAC.first_pixel_px, covariance))
     return Incoming(tuple(marks), tuple(cameras))
 

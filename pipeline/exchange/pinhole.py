@@ -32,7 +32,7 @@ from pipeline.exchange.incoming import (
     opencv_camera,
 )
 from pipeline.files.camera_file import CameraFile
-from pipeline.files.opencv_file import FISHEYE_MODEL, read_pixel_camera
+from pipeline.files.opencv_file import FISHEYE_MODEL, read_matrix, read_pixel_camera
 from pipeline.opencv_check.opencv_calibration import FISHEYE, INTERIOR, NAMES, fixed, model_names, opencv_values
 from pipeline.resampling.canvas import Canvas, outline_canvas
 from pipeline.results.comparator_file import ComparatorPoint
@@ -433,6 +433,7 @@ def import_opencv(paths: Sequence[Path], options: ImportOptions) -> Incoming:
     Cameras of one name that differ, as those of rectified frames of different sizes do, get their pictures' names too.
     """
     read, turns = list[tuple[str, CameraFile]](), dict[str, tuple[Array, Array]]()
+    pictures = set[str]()
     for path in paths:
         found, storage = read_pixel_camera(path)
         name = storage.getNode("camera").string() or path.stem
@@ -440,10 +441,15 @@ def import_opencv(paths: Sequence[Path], options: ImportOptions) -> Incoming:
         camera = opencv_camera(
             path, name, found.interior_px, found.distortion, found.size_px, options, OPENCV, found.family
         )
+        if picture in pictures:
+            raise InputError(f"{path}: image {picture!r} is given twice in the files. Name one of them.")
+        pictures.add(picture)
         read.append((picture, camera))
-        turn, shift = storage.getNode("R").mat(), storage.getNode("t").mat()
-        if turn is not None and shift is not None:
-            turns[picture] = np.array(turn, dtype=float), np.ravel(shift).astype(float)
+        if not (storage.getNode("R").empty() or storage.getNode("t").empty()):
+            turn, shift = (read_matrix(path, storage.getNode(key)) for key in ("R", "t"))
+            if turn.shape != (3, 3) or shift.size != 3:
+                raise InputError(f"{path}: R is to be a 3 x 3 rotation matrix, and t three numbers. Correct them.")
+            turns[picture] = turn, shift.ravel()
     first: dict[str, CameraFile] = {}
     differing = {one.name for _, one in read if replace(first.setdefault(one.name, one), path=one.path) != one}
     cameras = {

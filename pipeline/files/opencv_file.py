@@ -1,6 +1,7 @@
 """Cameras in files of cv2.FileStorage, in pixels; among them the lens of the camera that photographed the film."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -63,6 +64,13 @@ def read_pixel_camera(path: Path) -> tuple[PixelCamera, Any]:
         ) from None
 
 
+def read_matrix(path: Path, node: Any) -> Array:
+    """Matrix of a node. Raises InputError where it is none."""
+    with suppress(cv2.error, ValueError, TypeError):
+        return np.atleast_1d(np.array(node.mat(), dtype=float))
+    raise InputError(f"{path}: {node.name()} is no matrix (!!opencv-matrix). Write it as cv2.FileStorage does.")
+
+
 def _pixel_camera(path: Path, storage: Any) -> PixelCamera:
     def first(names: Sequence[str]) -> Any:
         nodes = (storage.getNode(name) for name in names)
@@ -87,8 +95,11 @@ def _pixel_camera(path: Path, storage: Any) -> PixelCamera:
         )
     family = "opencv_fisheye" if is_fisheye else "opencv"
     names = parameter_names(family)[:-2]  # b1 and b2 are part of the matrix
-    if values.size > len(names) or not (np.isfinite([*values, *k.ravel()]).all() and k[0, 0] > 0.0):
-        raise InputError(f"{path}: the camera matrix and up to {len(names)} distortion values are to be finite.")
+    if values.size > len(names) or not (np.isfinite([*values, *k.ravel()]).all() and min(k[0, 0], k[1, 1]) > 0.0):
+        raise InputError(
+            f"{path}: the camera matrix and up to {len(names)} distortion values are to be finite, and its fx and fy "
+            "positive."
+        )
     covariance, count = storage.getNode(COVARIANCE), 4 + values.size
     known = None if covariance.empty() else np.array(covariance.mat(), dtype=float)
     if known is not None and (known.shape != (count, count) or not np.allclose(known, known.T, atol=0.0)):

@@ -121,6 +121,7 @@ def test_what_does_not_fit_is_reported(tmp_path: Path, printed: Printed, refusal
     for arguments, words in (
         (["opencf", "out"], "did you mean"),
         (["juhl", "out"], "needs a radius r0"),
+        (["juhl", "out", "--r0-mm", "1e-300"], "needs a radius r0"),
         (["brown", "out", "--parameters", "k1,a2"], "brown has no parameter a2"),
     ):
         assert words in refusal(

@@ -76,7 +76,8 @@ def test_fiducials_from_a_corner_give_no_principal_point(tmp_path: Path, capsys:
 
 def test_marks_without_a_sigma_need_one_that_is_stated(tmp_path: Path, refusal: Refusal) -> None:
     file = tmp_path / "MeasuresIm-a.tif.xml"
-    file.write_text(MARKS.format("10 20").replace("<NameIm>a<", "<NameIm>a.tif<"))
+    none = "</NamePt><PrecPointe>-1</PrecPointe>"  # no standard deviation of 1 px
+    file.write_text(MARKS.format("10 20").replace("<NameIm>a<", "<NameIm>a.tif<").replace("</NamePt>", none))
     assert "say with --sigma-px" in refusal("import", "micmac", file, tmp_path / "o", *PITCH)
     assert "with --pitch-um" in refusal("import", "micmac", file, tmp_path / "o")
     folder = imported("micmac", [file], tmp_path, *PITCH, "--sigma-px", "0.2")
@@ -123,6 +124,11 @@ def test_cameras_of_rectified_frames_come_back_together(format: str, project: Pa
 MARK = "<OneMesureAF1I><NamePt>1</NamePt><PtIm>{}</PtIm></OneMesureAF1I>"
 MARKS = f"<MesureAppuiFlottant1Im><NameIm>a</NameIm>{MARK}</MesureAppuiFlottant1Im>"
 PIXELS = "%YAML:1.0\n---\nK: !!opencv-matrix {{rows: 3, cols: 3, dt: d, data: [9, 0, 5, 0, 9, 5, 0, 0, 1]}}\n{}\n"
+POSE = (
+    "R: !!opencv-matrix {{rows: {}, cols: {}, dt: d, data: [{}]}}\n"
+    "t: !!opencv-matrix {{rows: 1, cols: 3, dt: d, data: [{}]}}"
+)
+UNIT = "1, 0, 0, 0, 1, 0, 0, 0, 1"
 CERTIFICATE = "calibrated_principal_distance_mm = 153.0\nangle_deg = [7.5, 15.0, 22.7]\nradial_um = [1.0, 2.0, 1.0]\n"
 ENTITIES = '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]><a>&c;</a>'
 
@@ -148,7 +154,16 @@ ENTITIES = '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]><a>&c
         ("opencv", PIXELS.format("distortion_model: inverse_brown_conrady"), "inverse_brown_conrady, is none of"),
         ("opencv", PIXELS.format("xi: 0.8"), "omnidirectional (xi), is none of"),
         ("opencv", PIXELS.format("M2: 1"), "holds two cameras"),
+        ("opencv", PIXELS.format("R: 5\nt: 5"), "R is no matrix"),
+        ("opencv", PIXELS.format(POSE.format(3, 1, "0, 0, 0", "1, 2, 3")), "R is to be a 3 x 3 rotation matrix"),
+        ("opencv", PIXELS.format(POSE.format(3, 3, UNIT, "1").replace("1, cols: 3", "1, cols: 1")), "t three numbers"),
+        ("opencv", PIXELS.format(POSE.format(3, 3, "0, 0, 0, 0, 0, 0, 0, 0, 0", "1, 2, 3")), "is no rotation matrix"),
+        ("opencv", PIXELS.format(POSE.format(3, 3, "1, 0, 0, 0, 1, 0, 0, 0, -1", "1, 2, 3")), "is no rotation matrix"),
+        ("opencv", PIXELS.format(POSE.format(3, 3, UNIT, "1, .Nan, 3")), "is no rotation matrix"),
+        ("opencv", PIXELS.format("").replace("9, 5, 0", "-9, 5, 0"), "fx and fy positive"),
+        ("opencv", PIXELS.format("").replace("9, 5, 0", "0, 5, 0"), "fx and fy positive"),
         ("colmap", "", "is no reconstruction"),
+        ("certificate", CERTIFICATE.replace("22.7", "89.99999"), "no curve can be fitted"),
         ("certificate", "radial_um = [1.0]", "calibrated principal distance"),
         ("certificate", f"{CERTIFICATE}symmetry_mm = [0.0, 0.01]", "needs autocollimation_mm"),
         ("certificate", f"{CERTIFICATE}principal_point_mm = [0, 0]\nsymmetry_mm = [0.0, 0.01]", "Give either"),
@@ -160,6 +175,30 @@ def test_wrong_files_are_refused(format: str, text: str, words: str, tmp_path: P
     assert command("import", format, file, tmp_path / "o", *PITCH, "--sigma-px", "1") == WRONG_INPUT
     assert words in capfd.readouterr().err
     assert not (tmp_path / "o").exists()
+
+
+def test_an_image_and_a_certificate_are_given_once(tmp_path: Path, refusal: Refusal) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "1.yml").write_text(PIXELS.format(POSE.format(3, 3, UNIT, "1, 2, 3")))
+        (tmp_path / name / "c.toml").write_text(CERTIFICATE)
+    for format, file, words in (("opencv", "1.yml", "image '1' is given twice"), ("certificate", "c.toml", "'c'")):
+        files = (tmp_path / name / file for name in ("a", "b"))
+        assert words in refusal("import", format, *files, tmp_path / "o", *PITCH)
+
+
+def test_a_folder_that_is_a_link_stays_one_and_the_own_one_is_refused(
+    tmp_path: Path, refusal: Refusal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "certificate").symlink_to(tmp_path / "real")
+    (tmp_path / "c.toml").write_text(CERTIFICATE)
+    imported("certificate", [tmp_path / "c.toml"], tmp_path)
+    assert (tmp_path / "certificate").is_symlink()
+    assert (tmp_path / "real" / "camera.toml").exists()
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["c.toml", "certificate", "real"]
+    monkeypatch.chdir(tmp_path / "real")
+    assert "is the folder that reseau runs in" in refusal("import", "certificate", tmp_path / "c.toml", ".")
 
 
 def test_a_fisheye_of_opencv_s_own_program_is_one(tmp_path: Path) -> None:
