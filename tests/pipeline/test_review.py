@@ -128,8 +128,9 @@ def test_a_session_by_keyboard_alone_leads_to_the_right_marks(page: Page, measur
     expect(page.locator("#left")).to_contain_text("2 left: 2 marks")
     for done in range(2):
         expect(page.locator("#mark-view")).to_be_visible()
-        expect(page.locator("#facts")).to_contain_text("standard deviations")
         name = page.locator("#title").inner_text()
+        if name.startswith(review.SCRATCHED):  # the other one has no fit
+            expect(page.locator("#facts")).to_contain_text("standard deviations")
         page.keyboard.press("n" if name.startswith(review.BARE) else "a")
         expect(page.locator("#left")).not_to_contain_text(f"{2 - done} left")
         if done == 0:
