@@ -120,6 +120,7 @@ def test_equations_that_are_singular_in_digits_are_damped(monkeypatch: pytest.Mo
     monkeypatch.setattr(iteration, "factorise", first_singular)
     result = adjust(network, start)
     assert result.converged
+    assert result.run.solution.history[0].damping > 0.0
     np.testing.assert_allclose(result.values, expected.values, atol=1e-9)
 
 
