@@ -26,16 +26,8 @@ from adjust.problem.condition_equations import observed_in_camera
 from adjust.problem.estimates import NullDirection
 from adjust.problem.parameter import Parameter, description, enumeration
 from adjust.problem.problem import Problem, State
+from adjust.rank_defect import directions
 from adjust.rank_defect.datum import free_coordinates, object_datum
-from adjust.rank_defect.directions import (
-    datum_sentence,
-    field_geometry,
-    followers,
-    many_sentence,
-    named_directions,
-    own_sentence,
-    unnamed_sentence,
-)
 
 REACHES = (0.3, 1.0, 3.0, 10.0)  # in radii; the first one that the observations do not contradict is used
 CONTRADICTED = 0.01  # p-value of the parameters' size below which the pseudo-observations are contradicted
@@ -169,7 +161,7 @@ def singular_directions(numbering: Numbering, state: State, factor: Factor) -> t
     for block in blind:
         for vector in block.right.T:
             moved = tuple(parameters[numbering.free[block.own[i]]] for i in _largest(vector))
-            within_blocks.append(NullDirection(moved, *own_sentence(numbering.problem, state, moved[0])))
+            within_blocks.append(NullDirection(moved, *directions.own_sentence(numbering.problem, state, moved[0])))
     return (*within_blocks, *named, *left)
 
 
@@ -213,7 +205,7 @@ def weak_directions(
     named, left = ([each for each in some if _motion(each) not in again] for some in found)
     if len(left) > NAMES_SHOWN:  # many directions that have no name, as one
         moved = tuple(dict.fromkeys(moved for each in left for moved in each.parameters))
-        left = [NullDirection(_collapsed(moved), *many_sentence(len(left), followers(moved)))]
+        left = [NullDirection(_collapsed(moved), *directions.many_sentence(len(left), directions.followers(moved)))]
     return (*named, *left)
 
 
@@ -244,7 +236,7 @@ def undetermined(problem: Problem, state: State, variances: Array) -> str:
             f"{statement}. Only the given values determine them: give these with realistic standard deviations, or "
             "fix what you do not need."
         )
-    field = field_geometry(problem, state, cameras[0])
+    field = directions.field_geometry(problem, state, cameras[0])
     return f"{statement}, for {field.because}. To determine them, {field.remedy}."
 
 
@@ -255,7 +247,7 @@ def loose_principal_distances(problem: Problem, state: State, variances: Array) 
         at = positions[0]
         share = float(np.sqrt(variances[at]) / state.values[at])
         if np.isinf(unknowns.sigma[at]) and share > LOOSE:
-            field = field_geometry(problem, state, name)
+            field = directions.field_geometry(problem, state, name)
             yield (
                 f"The principal distance of camera {name} is determined to {100.0 * share:.0f} % only, for "
                 f"{field.because}. To determine it better, {field.remedy}; or give it with its standard deviation."
@@ -283,13 +275,13 @@ def _named_directions(
     parameters = [problem.unknowns.parameters[i] for i in free]
     datum, numbers, rest = _datum_part(numbering, state, factor, blind, null)
     named = [
-        NullDirection(_collapsed([parameters[i] for i in _largest(vector)]), *datum_sentence(number))
+        NullDirection(_collapsed([parameters[i] for i in _largest(vector)]), *directions.datum_sentence(number))
         for vector, number in zip(datum.T, numbers, strict=True)
     ]
     # Add as much of the free datum as keeps the object points in place.
     points = np.isin(free, free_coordinates(problem))
     still = np.asarray(rest - datum @ np.linalg.lstsq(datum[points], rest[points])[0])
-    leads = named_directions(problem, state)
+    leads = directions.named_directions(problem, state)
     functionals = np.array([lead.functional[free] for lead in leads]).reshape(len(leads), len(free)) / factor.scale
     lengths = np.linalg.norm(functionals, axis=1, keepdims=True)
     visibility = (functionals / np.where(lengths > 0.0, lengths, 1.0)) @ rest
@@ -306,9 +298,9 @@ def _named_directions(
         # By the unknown that moves most: of one point or image, or of many.
         most, moved = parameters[int(np.argmax(np.abs(vector)))], [parameters[i] for i in _largest(vector)]
         if len({(each.owner, each.id) for each in moved}) == 1 and most.kind in ("point", "exterior", "film"):
-            sentence = own_sentence(problem, state, most)
+            sentence = directions.own_sentence(problem, state, most)
         else:
-            sentence = unnamed_sentence(most, followers(set(moved) - {most}))
+            sentence = directions.unnamed_sentence(most, directions.followers(set(moved) - {most}))
         unnamed.append(NullDirection(_collapsed(moved), *sentence))
     return named, unnamed
 

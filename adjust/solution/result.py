@@ -12,15 +12,8 @@ from adjust.array_types import Array, Indices, Mask
 from adjust.display import CameraPlots, PlottedResult, data_frame
 from adjust.least_squares.equations import Numbering
 from adjust.least_squares.iteration import Iteration
+from adjust.problem import estimates
 from adjust.problem.camera import Camera
-from adjust.problem.estimates import (
-    Cofactor,
-    Estimates,
-    NullDirection,
-    VarianceFactor,
-    adjusted_lens,
-    observed_places,
-)
 from adjust.problem.network import STRAIGHT, Approximations
 from adjust.problem.parameter import Parameter
 from adjust.problem.problem import Problem
@@ -51,15 +44,7 @@ from adjust.quality.significance import (
     significance_tests,
 )
 from adjust.quality.variance_components import factor_sigmas, variance_factor
-from adjust.rank_defect.datum import (
-    CENTERINGS,
-    EXACT,
-    centered,
-    chosen_coordinates,
-    chosen_points,
-    minimal_datum,
-    object_datum,
-)
+from adjust.rank_defect import datum
 from adjust.rank_defect.diagnosis import held_directions, inseparable
 from adjust.solution.explanations import Explanation, explain
 from adjust.solution.model_hypotheses import diameter_notes
@@ -69,7 +54,7 @@ from adjust.solution.warnings import curved_valley_warnings, film_scale_notes, h
 
 
 @dataclass(frozen=True, repr=False)
-class Adjustment(Estimates, PlottedResult):
+class Adjustment(estimates.Estimates, PlottedResult):
     """Adjusted network with residuals, tests and messages.
 
     Attributes
@@ -98,7 +83,7 @@ class Adjustment(Estimates, PlottedResult):
     unknowns: int
     redundancy: int
     vpv: float
-    singular: tuple[NullDirection, ...]
+    singular: tuple[estimates.NullDirection, ...]
     history: tuple[Iteration, ...]
     weights: Array = field(default_factory=lambda: np.empty(0))
     variance_factors: Mapping[str, float] = field(default_factory=dict)
@@ -221,9 +206,9 @@ class Adjustment(Estimates, PlottedResult):
             return found.places_mm, found.sigma_mm
 
         observations, v_mm = self.network.observations, self.residuals.v_mm
-        rows, observed = observed_places(self, shown.name, observations.xy_mm)
-        _, adjusted = observed_places(self, shown.name, observations.xy_mm + v_mm)
-        lens = adjusted_lens(self, shown.name)
+        rows, observed = estimates.observed_places(self, shown.name, observations.xy_mm)
+        _, adjusted = estimates.observed_places(self, shown.name, observations.xy_mm + v_mm)
+        lens = estimates.adjusted_lens(self, shown.name)
         keys = [Parameter.interior(shown.name, each) for each in lens.quantities]
         return CameraPlots(
             name=shown.name,
@@ -330,7 +315,7 @@ def _is_fixed(problem: Problem, last: Run) -> bool:
     return bool((last.problem.unknowns.sigma != problem.unknowns.sigma).any())
 
 
-def _cofactor(problem: Problem, last: Run, members: Indices | None) -> Cofactor:
+def _cofactor(problem: Problem, last: Run, members: Indices | None) -> estimates.Cofactor:
     """Compute the cofactor matrix in the datum of a run, or with inner constraints over the coordinates `members`."""
     if not last.has_solution:
         return NoCofactor(len(problem.unknowns))
@@ -372,7 +357,7 @@ def _result(given: Problem, last: Run, members: Indices | None, probabilities: P
     )
 
 
-def _scaled_run(last: Run, variance: VarianceFactor) -> Run:
+def _scaled_run(last: Run, variance: estimates.VarianceFactor) -> Run:
     """Divide the standard deviations of the given values excluded from sigma0 by sigma0."""
     # sigma0 times their cofactors then gives their standard deviations as given.
     if not len(variance.positions):
@@ -398,7 +383,7 @@ def _meaningless(problem: Problem) -> Mask:
     return meaningless
 
 
-def _redundancy(run: Run, cofactor: Cofactor) -> int:
+def _redundancy(run: Run, cofactor: estimates.Cofactor) -> int:
     """Equations minus unknowns, without equations removed and with rank defects held by pseudo-observations."""
     problem = run.problem
     further = sum(len(each.observed) for each in problem.further)
@@ -418,7 +403,7 @@ def adjust_problem(
     held: positions of quantities that stay at their start. doubted: positions of quantities whose given values are left
     out at first; mismatched: rows of observations that are left out unless they agree with the rest (see `run`).
     """
-    members = chosen_points(problem, options.datum_points)
+    members = datum.chosen_points(problem, options.datum_points)
     solved = settle_datum(problem, options)
     solution = run(replace(solved, unknowns=solved.unknowns.fixed(held)), options, doubted, mismatched or {})
     if options.datum == "free":
@@ -430,12 +415,12 @@ def settle_datum(problem: Problem, options: Options) -> Problem:
     """Fix a minimal datum in a problem, unless the given values are to define the datum."""
     unknowns = problem.unknowns
     if options.datum_coordinates:
-        unknowns = unknowns.fixed_as_given(chosen_coordinates(problem, options.datum_coordinates))
+        unknowns = unknowns.fixed_as_given(datum.chosen_coordinates(problem, options.datum_coordinates))
     elif options.datum != "control":
-        unknowns = unknowns.fixed(minimal_datum(problem))
+        unknowns = unknowns.fixed(datum.minimal_datum(problem))
     settled = replace(problem, unknowns=unknowns)
     is_bent = not problem.network.line_of_sight.is_straight
-    if is_bent and object_datum(settled, settled.start()).free.shape[1] > 0:
+    if is_bent and datum.object_datum(settled, settled.start()).free.shape[1] > 0:
         # Bent lines of sight would determine the datum, but hardly.
         return replace(settled, network=replace(problem.network, line_of_sight=STRAIGHT))
     return settled
@@ -449,12 +434,12 @@ def _center_datum(problem: Problem, last: Run, members: Indices, options: Option
     """
     if not _is_fixed(problem, last):
         return last
-    extent = object_datum(problem, last.end.state).extent
-    for _ in range(CENTERINGS):
+    extent = datum.object_datum(problem, last.end.state).extent
+    for _ in range(datum.CENTERINGS):
         if not last.converged:
             return last
-        state, before = centered(problem, last.end.state, members), last
-        if np.abs(state.values - before.end.state.values)[members].max(initial=0.0) <= EXACT * extent:
+        state, before = datum.centered(problem, last.end.state, members), last
+        if np.abs(state.values - before.end.state.values)[members].max(initial=0.0) <= datum.EXACT * extent:
             break
         last = again(before, before.weighting, options.iteration_limit, state)
         history = before.solution.history + last.solution.history

@@ -21,30 +21,7 @@ from adjust.quality.lens_uncertainty import projection_uncertainty
 from adjust.quality.reliability import Reliability, Suspect
 from adjust.quality.significance import CalibrationTest, SignificanceTest
 from adjust.solution.result import Adjustment
-from pipeline.results.adjustment_record import (
-    AdjustmentRecord,
-    BoardRecord,
-    CameraRecord,
-    DistortionRecord,
-    ExteriorRecord,
-    FiducialRecord,
-    FilmRecord,
-    GivenQuantity,
-    GroupTestRecord,
-    ImageRecord,
-    JoinedFrameRecord,
-    JoinRecord,
-    LensReachRecord,
-    PartMarkRecord,
-    PartRecord,
-    PointRecord,
-    PrincipalPointRecord,
-    ProjectionRecord,
-    Quantity,
-    ScannerRecord,
-    Sigma0Record,
-    TakingLensRecord,
-)
+from pipeline.results import adjustment_record as records
 from pipeline.results.assessment_record import (
     ContradictionDirection,
     ContradictionRecord,
@@ -67,20 +44,20 @@ MOST_IMAGES = 500  # in larger networks projection_uncertainty takes too long to
 AFFORDABLE = 3000  # largest number of quantities whose covariance is written as one matrix
 
 
-def joined_frames(adjustment: Adjustment) -> dict[str, JoinedFrameRecord]:
+def joined_frames(adjustment: Adjustment) -> dict[str, records.JoinedFrameRecord]:
     """Records of the frames scanned in parts, by frame; empty without such frames or without a solution.
 
     Coordinates are camera coordinates in mm, sigmas a posteriori.
     """
     if not adjustment.converged:
         return {}
-    network, parts = adjustment.network, defaultdict[str, dict[str, PartRecord]](dict)
-    marks, camera_mm = defaultdict[str, list[PartMarkRecord]](list), dict[int, Array]()
+    network, parts = adjustment.network, defaultdict[str, dict[str, records.PartRecord]](dict)
+    marks, camera_mm = defaultdict[str, list[records.PartMarkRecord]](list), dict[int, Array]()
     for image in network.images:
         if image.part_of:
             parts[image.part_of][image.name], own = _part(adjustment, image, camera_mm)
             marks[image.part_of] += own
-    joins = defaultdict[str, list[JoinRecord]](list)
+    joins = defaultdict[str, list[records.JoinRecord]](list)
     for (frame, point), rows in network.joins.items():
         if frame in parts:
             begun, *others = rows.tolist()
@@ -88,11 +65,15 @@ def joined_frames(adjustment: Adjustment) -> dict[str, JoinedFrameRecord]:
                 names = tuple(network.observations.image[row] for row in (begun, other))
                 first, second = camera_mm[begun], camera_mm[other]
                 apart_um, middle = UM_PER_MM * (second - first), (first + second) / 2.0
-                joins[frame].append(JoinRecord(point, names, *middle.tolist(), *apart_um.tolist()))
-    return {frame: JoinedFrameRecord(own, tuple(joins[frame]), tuple(marks[frame])) for frame, own in parts.items()}
+                joins[frame].append(records.JoinRecord(point, names, *middle.tolist(), *apart_um.tolist()))
+    return {
+        frame: records.JoinedFrameRecord(own, tuple(joins[frame]), tuple(marks[frame])) for frame, own in parts.items()
+    }
 
 
-def _part(adjustment: Adjustment, image: Image, camera_mm: dict[int, Array]) -> tuple[PartRecord, list[PartMarkRecord]]:
+def _part(
+    adjustment: Adjustment, image: Image, camera_mm: dict[int, Array]
+) -> tuple[records.PartRecord, list[records.PartMarkRecord]]:
     """Records of a partial scan and its marks, whose camera coordinates by the film transformation are added by row.
 
     Tie points and fiducials have adjusted coordinates. Targets have measured ones; their covariance is that of the
@@ -121,24 +102,24 @@ def _part(adjustment: Adjustment, image: Image, camera_mm: dict[int, Array]) -> 
             place, covariance = adjustment.values_of(own), variance * adjustment.cofactor_of(own)
         sx, sy = np.sqrt(np.diag(covariance)).tolist()
         rho = float(covariance[0, 1] / (sx * sy)) if sx * sy > 0.0 else 0.0
-        marks.append(PartMarkRecord(image.name, point, kind, float(place[0]), float(place[1]), sx, sy, rho))
-    return PartRecord(float(UM_PER_MM * np.sqrt(np.linalg.eigvalsh(of_film[-4:])[:, -1].max()))), marks
+        marks.append(records.PartMarkRecord(image.name, point, kind, float(place[0]), float(place[1]), sx, sy, rho))
+    return records.PartRecord(float(UM_PER_MM * np.sqrt(np.linalg.eigvalsh(of_film[-4:])[:, -1].max()))), marks
 
 
 def adjustment_record(
     adjustment: Adjustment, frames_mm: Mapping[str, tuple[float, float]], made_from: Mapping[str, str]
-) -> AdjustmentRecord:
+) -> records.AdjustmentRecord:
     """Convert an adjustment to its record; parameters as in `write_adjustment`."""
     network, variance = adjustment.network, adjustment.variance
     used = {image.camera for image in network.images}
     reliability, further = adjustment.reliability, _further(adjustment)
     return record_from(
-        AdjustmentRecord,
+        records.AdjustmentRecord,
         adjustment,
         reseau=version("reseau"),
         made_from=dict(made_from),
         observations=adjustment.conditions,
-        sigma0_from=Sigma0Record(variance.redundancy, variance.is_a_priori, variance.left_out),
+        sigma0_from=records.Sigma0Record(variance.redundancy, variance.is_a_priori, variance.left_out),
         covariance=covariance_note(adjustment),
         suspects=tuple(map(_suspect, adjustment.suspects)),
         reliability=None if reliability is None else _reliability(reliability, len(network.observations)),
@@ -148,11 +129,11 @@ def adjustment_record(
             if camera.name in used
         },
         scanners={
-            each.name: ScannerRecord(
+            each.name: records.ScannerRecord(
                 each.center_mm,
                 each.half_mm,
                 *_terms(adjustment, "scanner", each.name, each.terms),
-                None if each.lens is None else TakingLensRecord.from_lens(each.lens),
+                None if each.lens is None else records.TakingLensRecord.from_lens(each.lens),
             )
             for each in network.scanners
         },
@@ -183,11 +164,11 @@ def adjustment_record(
     )
 
 
-def _camera(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, float] | None) -> CameraRecord:
+def _camera(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, float] | None) -> records.CameraRecord:
     is_idle = camera.name in adjustment.network.idle_cameras
     tests, together = _tests(adjustment, "interior", camera.name)
 
-    def quantity(name: str, given: Prior | None) -> Quantity:
+    def quantity(name: str, given: Prior | None) -> records.Quantity:
         parameter = Parameter.interior(camera.name, name)
         if is_idle:
             return replace(_quantity(adjustment, parameter, given), sigma=math.nan)
@@ -200,24 +181,24 @@ def _camera(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, float
     given = camera.distortion.parameters
     parameters = {key: quantity(key, given.get(key, Prior(0.0))) for key in parameter_names(camera.distortion.family)}
     reach = adjustment.lens_reach(camera, frame_mm)
-    return CameraRecord(
+    return records.CameraRecord(
         principal_distance_mm=quantity("c", camera.principal_distance_mm),
-        principal_point_mm=PrincipalPointRecord(quantity("x0", camera.x0_mm), quantity("y0", camera.y0_mm)),
-        distortion=DistortionRecord.from_distortion(camera.distortion, parameters),
+        principal_point_mm=records.PrincipalPointRecord(quantity("x0", camera.x0_mm), quantity("y0", camera.y0_mm)),
+        distortion=records.DistortionRecord.from_distortion(camera.distortion, parameters),
         significance=together,
         fiducials={
-            id: FiducialRecord(
+            id: records.FiducialRecord(
                 _quantity(adjustment, x, mark.x_mm), _quantity(adjustment, y, mark.y_mm), _correlation(adjustment, x, y)
             )
             for id, mark in camera.fiducials.items()
             for x, y in [[Parameter.fiducial(camera.name, id, axis) for axis in "xy"]]
         },
-        lens_known=None if reach is None else record_from(LensReachRecord, reach),
+        lens_known=None if reach is None else record_from(records.LensReachRecord, reach),
         projection=() if reach is None else tuple(_projection(adjustment, camera.name)),
     )
 
 
-def _projection(adjustment: Adjustment, camera: str) -> Iterator[ProjectionRecord]:
+def _projection(adjustment: Adjustment, camera: str) -> Iterator[records.ProjectionRecord]:
     """Precision of projected points at infinity and at the median distance of the targets."""
     if len(adjustment.network.images) > MOST_IMAGES:
         return
@@ -228,18 +209,20 @@ def _projection(adjustment: Adjustment, camera: str) -> Iterator[ProjectionRecor
         x_mm, y_mm = known.places_mm[0, :, 0], known.places_mm[::-1, 0, 1]
         sigma_um = [[float(f"{UM_PER_MM * each:.4g}") for each in row] for row in known.sigma_mm[::-1]]
         distance = known.distance if math.isfinite(known.distance) else math.nan
-        yield ProjectionRecord(distance, tuple(x_mm.tolist()), tuple(y_mm.tolist()), tuple(map(tuple, sigma_um)))
+        yield records.ProjectionRecord(
+            distance, tuple(x_mm.tolist()), tuple(y_mm.tolist()), tuple(map(tuple, sigma_um))
+        )
 
 
-def _board(adjustment: Adjustment, board: Board) -> BoardRecord:
+def _board(adjustment: Adjustment, board: Board) -> records.BoardRecord:
     bends = dict(zip(board.names, board.bends, strict=True))
     terms, together = _terms(adjustment, "board", board.name, bends)
-    return BoardRecord(points=len(board.places), terms=terms, significance=together)
+    return records.BoardRecord(points=len(board.places), terms=terms, significance=together)
 
 
 def _terms(
     adjustment: Adjustment, kind: Kind, owner: str, terms: Mapping[str, Prior]
-) -> tuple[dict[str, Quantity], tuple[GroupTestRecord, ...]]:
+) -> tuple[dict[str, records.Quantity], tuple[records.GroupTestRecord, ...]]:
     """Terms with their significance tests, and the tests of groups."""
     tests, together = _tests(adjustment, kind, owner)
     quantities = {
@@ -251,14 +234,16 @@ def _terms(
 
 def _tests(
     adjustment: Adjustment, kind: Kind, owner: str
-) -> tuple[dict[str, SignificanceTest], tuple[GroupTestRecord, ...]]:
+) -> tuple[dict[str, SignificanceTest], tuple[records.GroupTestRecord, ...]]:
     """Significance tests: of single parameters by name, and of groups."""
     tests = adjustment.significance.get((kind, owner), ())
-    groups = (GroupTestRecord(each.name, each.parameters, each.statistic, each.p) for each in tests if each.is_group)
+    groups = (
+        records.GroupTestRecord(each.name, each.parameters, each.statistic, each.p) for each in tests if each.is_group
+    )
     return {each.name: each for each in tests if not each.is_group}, tuple(groups)
 
 
-def _image(adjustment: Adjustment, image: Image) -> ImageRecord:
+def _image(adjustment: Adjustment, image: Image) -> records.ImageRecord:
     film_keys = [Parameter.film(image.name, name) for name in film_parameter_names(image.transformation)]
     exterior_keys = [Parameter.exterior(image.frame, element) for element in EXTERIOR_NAMES]
     film = {}
@@ -272,18 +257,18 @@ def _image(adjustment: Adjustment, image: Image) -> ImageRecord:
         elements.append(_quantity(adjustment, key, given, DEG_PER_RAD if key.quantity in ANGLES else 1.0))
     if image.name in adjustment.network.unoriented:
         elements = [replace(each, sigma=math.nan) for each in elements]
-    return ImageRecord(
+    return records.ImageRecord(
         camera=image.camera,
         scanner=image.scanner,
         part_of=image.part_of or None,
-        transformation=FilmRecord(
+        transformation=records.FilmRecord(
             kind=image.transformation, mirrored=image.name in adjustment.mirrored, parameters=film
         ),
-        exterior=ExteriorRecord(*elements),
+        exterior=records.ExteriorRecord(*elements),
     )
 
 
-def _point(adjustment: Adjustment, point: ObjectPoint) -> PointRecord:
+def _point(adjustment: Adjustment, point: ObjectPoint) -> records.PointRecord:
     """Coordinates of a point with their priors; the deflection of a bent board is added."""
     keys = [Parameter.point(point.id, axis) for axis in "XYZ"]
     place = {key.quantity: _quantity(adjustment, key, prior) for key, prior in zip(keys, point.priors, strict=True)}
@@ -296,7 +281,7 @@ def _point(adjustment: Adjustment, point: ObjectPoint) -> PointRecord:
             for axis, value, variance in zip("XYZ", values, variances, strict=True):
                 sigma = adjustment.sigma0 * math.sqrt(variance) if _has_solution(adjustment) else math.nan
                 place[axis] = replace(place[axis], value=float(value), sigma=sigma)
-    return PointRecord(**place)
+    return records.PointRecord(**place)
 
 
 def _quantity(
@@ -305,12 +290,12 @@ def _quantity(
     given: Prior | None = None,
     scale: float = 1.0,
     test: SignificanceTest | None = None,
-) -> Quantity:
+) -> records.Quantity:
     """Value and a-posteriori sigma; NaN without a solution, since zero means that the quantity was fixed."""
-    return Quantity(
+    return records.Quantity(
         value=scale * adjustment.value(parameter),
         sigma=scale * adjustment.sigma(parameter) if _has_solution(adjustment) else math.nan,
-        given=None if given is None else GivenQuantity(scale * given.value, scale * given.sigma),
+        given=None if given is None else records.GivenQuantity(scale * given.value, scale * given.sigma),
         t=None if test is None else test.statistic,
         p=None if test is None else test.p,
     )
