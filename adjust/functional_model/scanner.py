@@ -6,7 +6,7 @@
 The sum is the displacement of a point by the scanner; all parameters are in mm. Scanner terms that a film
 transformation can absorb cannot be estimated separately: only terms that no transformation absorbs are offered. A term
 `a21` is a single product. `stretch`, `shear`, `tilt_x` and `tilt_y` are combinations orthogonal to those that a
-similarity or a projective transformation absorbs (see `polynomial_sets`).
+similarity or a projective transformation absorbs (see `distortion_models`).
 
 A scan taken by a digital camera also has that camera's lens distortion. The lens is known and is applied first:
 S(x_s, y_s) removes the lens distortion from the comparator coordinates (image coordinates of the digital camera), then

@@ -211,7 +211,6 @@ def levelled(model: Array, heights: Array, stations: Array, principal_distance_m
     model : (n, 3) points in the model.
     heights : (n,) their heights.
     stations : (k, 3) projection centres in the model, above the points.
-
     principal_distance_mm : height of the stations in object units where equal heights leave the scale open.
 
     Returns

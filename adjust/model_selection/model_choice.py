@@ -23,6 +23,7 @@ from scipy.special import chdtri
 
 from adjust.array_types import Array, Indices
 from adjust.errors import AdjustmentError
+from adjust.functional_model.distortion_models import UM_PER_MM
 from adjust.functional_model.families import family, parameter_names
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.scanner import is_left
@@ -57,7 +58,6 @@ SETS = {"ebner": ("b1", "b2"), "legendre(3)": ("a10", "a01")}  # their parameter
 DECISIVE = 10.0  # difference of AICc above which the worse model has essentially no support (Burnham and Anderson)
 FEWEST_FOLDS, MOST_FOLDS, RAYS_AT_ONCE = 5, 20, 300  # more folds than the fewest have about so many rays each
 FEWEST_KNOWN = 10  # fewer known points than this stay in every fit: they define the datum
-UM_PER_MM = 1000.0
 ROUNDS = 3  # rounds of selecting distortion, scanner terms and transformation in turn
 
 RULE = (

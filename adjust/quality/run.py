@@ -14,6 +14,7 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 
 from adjust.array_types import Array, Indices, Mask
+from adjust.functional_model.distortion_models import UM_PER_MM
 from adjust.least_squares.equations import Numbering, prior_differences
 from adjust.least_squares.iteration import Linearised, Solution, linearise
 from adjust.linear_algebra.factor import Blocks, Factor
@@ -25,7 +26,6 @@ from adjust.quality.critical_values import TestedUnits, Weighting
 from adjust.rank_defect.diagnosis import pseudo_square_sum
 
 UNCHECKED = 1e-9  # redundancy below which an observation is unchecked
-UM_PER_MM = 1000.0
 NEARLY_ONE = 0.99  # least redundancy of a group with a sigma0 of its own
 
 

@@ -11,6 +11,7 @@ from typing import Literal, cast, get_args
 
 import numpy as np
 
+from adjust.functional_model.opencv_family import FISHEYE_NAMES, OPENCV_NAMES
 from pipeline.calibration.intrinsics import CameraIntrinsics, LensModel, LensSetting, free_lens
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures
 from pipeline.errors import InputError
@@ -142,8 +143,7 @@ def _length_mm(option: str, text: str) -> float:
     return float(found[1]) * MM[found[2]]
 
 
-OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
-FISHEYE_ORDER = ("k1", "k2", "k3", "k4")
+OPENCV_ORDER, FISHEYE_ORDER = OPENCV_NAMES[:-2], FISHEYE_NAMES[:-2]  # without b1 and b2
 
 
 @dataclass(frozen=True)

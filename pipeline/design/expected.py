@@ -20,10 +20,10 @@ from adjust.solution.adjustment import Options
 from adjust.solution.planning import Plan, plan
 from pipeline.adjusting.network import FEWEST_TARGETS
 from pipeline.design.setup import Setup, planned_network
+from pipeline.results.image_unit import UM_PER_MM
 from pipeline.types import Array
 from synthetic_images.scene import SceneImage
 
-UM_PER_MM = 1000.0
 IN_MM = ("target", "tie", "fiducial", "datum", "scanner", "fiducial distance")
 
 DIRECTIONS = 36

@@ -16,6 +16,7 @@ from pipeline.design.sweeps import Swept, Variations, over_layouts, sweep
 from pipeline.drawing import svg
 from pipeline.progress import Reporter
 from pipeline.report.numbers import NONE, fixed, significant, typed, value_and_sigma
+from pipeline.results.image_unit import UM_PER_MM
 from pipeline.results.record_json import write_record
 from pipeline.terminal import uncut_table
 from pipeline.text.files import check_writable
@@ -27,7 +28,6 @@ WIDTH_PX, HEIGHT_PX, KEY_PX = 760.0, 460.0, 160.0
 ROW_PX = 17.0  # px, height of a name in the legend
 UNDETERMINED = "not determined"
 SLOPE = "slope"  # last row of the table of a sweep
-UM_PER_MM = 1000.0
 KINDS = {
     "datum": "given fiducial",
     "control": "given point",

@@ -128,7 +128,7 @@ class Converted:
 
     Attributes
     ----------
-    parameters : (n,) in the order of `opencv_model.model_names`.
+    parameters : (n,) in the order of `model_names`.
     sigmas : (n,) a-priori standard deviations.
     residual_mm : difference of the two lenses over the image, rms per point.
     """
@@ -666,7 +666,7 @@ def converted(problem: BareProblem, solved: Adjustment) -> Converted:
     observed = problem.network.observations.xy_mm
     corners_mm = np.array([observed.min(axis=0), observed.max(axis=0)])
     fitted = ("k1", "k2", "p1", "p2", "k3", *(["b1"] if "fy" in COUNTERPARTS[family].values() else []))
-    whole = to_opencv_model(lens, corners_mm, ("b1",) if family in ("opencv", FISHEYE) else fitted)
+    whole = to_opencv_model(lens, corners_mm, ("b1",) if family == "opencv" else fitted)
     # OpenCV holds the parameters that it does not estimate at these values. Its standard deviations assume them.
     held = dict(zip(whole.lens.quantities[3:], whole.lens.parameters.tolist(), strict=True))
     model = fixed(whole.lens.distortion.family, held)

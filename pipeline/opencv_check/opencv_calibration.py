@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from adjust.functional_model import opencv_family
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.functional_model.lens_conversion import ConvertedLens, convert_lens
@@ -17,12 +18,10 @@ from measure.scans.parallel import one_opencv_thread
 from pipeline.types import Array
 
 INTERIOR = ("fx", "fy", "cx", "cy")
-NAMES = (
-    *INTERIOR, "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y",
-)  # fmt: skip
+NAMES = (*INTERIOR, *opencv_family.OPENCV_NAMES[:-2])  # without b1 and b2, which fx and fy hold
 OPENCV_RADIAL = ("k1", "k2", "k3", "k4", "k5", "k6")  # numerator and denominator
 FISHEYE = "opencv_fisheye"  # name of this model's family in the adjustment
-FISHEYE_NAMES = (*INTERIOR, "k1", "k2", "k3", "k4", "alpha")
+FISHEYE_NAMES = (*INTERIOR, *opencv_family.FISHEYE_NAMES[:-2], "alpha")
 Y_UP = np.array([1.0, -1.0])
 
 PICTURE_PX = 4000.0  # px, longer side of the frame in the observations for OpenCV
@@ -132,7 +131,7 @@ class OpenCvCalibration:
 
     Attributes
     ----------
-    parameters : (n,) in the order of `opencv_model.model_names`.
+    parameters : (n,) in the order of `model_names`.
     sigmas : (n,) standard deviations.
     rms_um : per point.
     rounding_um : rms change of an image coordinate by the rounding to single precision, which OpenCV requires.

@@ -19,7 +19,7 @@ from pipeline.report.parameters import camera_values, parameter_rows, term_rows
 from pipeline.report.vectors import grid_mm, longest_vector, padded_plane, strokes_and_dots
 from pipeline.results.adjustment_file import ParameterCovariance
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, JoinedFrameRecord, ScannerRecord
-from pipeline.results.image_unit import ImageUnit
+from pipeline.results.image_unit import UM_PER_MM, ImageUnit
 from pipeline.types import Array
 
 PLOT_PX = 400.0
@@ -31,7 +31,6 @@ SCANNER_PLOT_PX = 560.0
 GRID = 9  # vectors along the longer side
 LONGEST = 0.8  # longest vector with its ellipse, in grid spacings
 ROOM = 0.06  # margin around the extent, fraction of its longer side
-UM_PER_MM = 1000.0
 
 JOINED_PLOT_PX = 420.0
 LONGEST_JOIN_PX = 40.0

@@ -176,7 +176,7 @@ def _circle(center_mm: Array, radius_mm: float, on: Plane) -> Markup:
     return svg.strokes(on.page(points[:-1][shown]), on.page(points[1:][shown]), "reach")
 
 
-def curves_plot(drawn: Curves, observed_radius_mm: float, unit: ImageUnit = FILM_UNIT, width: float = 400.0) -> Markup:
+def curves_plot(drawn: Curves, observed_radius_mm: float, unit: ImageUnit = FILM_UNIT) -> Markup:
     """Plot radial and asymmetric distortion with their 95 % bands; grey beyond the outermost target."""
     pairs = {"first": (drawn.radial_um, drawn.radial_sigma_um)}
     if np.any(drawn.asymmetric_um > 1e-6):
@@ -186,7 +186,7 @@ def curves_plot(drawn: Curves, observed_radius_mm: float, unit: ImageUnit = FILM
     low = min(0.0, *(float((value - BAND * sigma).min()) for value, sigma in curve_of.values()))
     high = max(0.0, *(float((value + BAND * sigma).max()) for value, sigma in curve_of.values()))
     room = 0.06 * max(high - low, 1e-3)
-    axes = svg.Axes((0.0, float(radius[-1])), (low - room, high + room), width=width, height=0.75 * width)
+    axes = svg.Axes((0.0, float(radius[-1])), (low - room, high + room), width=400.0, height=300.0)
     x = axes.x(radius)
     labels = axes.grid(f"radius from the principal point ({unit.long_name})", f"displacement ({unit.short_name})")
     content = []

@@ -252,21 +252,21 @@ def unread_scans(data: ReportData, path: Path, images: Collection[str] | None = 
     return iter(()) if digest is None else measured_scans(path, digest, images)
 
 
-def report_data(project: Project, at: At, most_frames: int = MOST_FRAMES) -> ReportData:
-    """Load all data of a report. With more than most_frames frames: totals, and the frames that need a look."""
+def report_data(project: Project, at: At) -> ReportData:
+    """Load all data of a report. With more than MOST_FRAMES frames: totals, and the frames that need a look."""
 
     def image_camera(image: str) -> str:
         return project.image_camera(image).name
 
     with _stored(project, at) as stored:
-        if stored is not None and len(stored.names) > most_frames:
+        if stored is not None and len(stored.names) > MOST_FRAMES:
             needed = stored.names - {image for image, _, _ in stored.plain}
             data = measured_data(project, at, rows=list(stored.points(needed)))
             return reduced(data, stored.scans(needed), image_camera, stored)
-    data = adjusted_data(project, at, most_frames)
+    data = adjusted_data(project, at, MOST_FRAMES)
     return (
         data
-        if _frame_count(data) <= most_frames
+        if _frame_count(data) <= MOST_FRAMES
         else reduced(data, unread_scans(data, project.measurement_path), image_camera)
     )
 

@@ -106,7 +106,7 @@ class Canvas:
     height_px: int
 
     def camera_from_pixel(self, pixels: Array) -> Array:
-        """Camera coordinates (n, 2) of columns and rows (n, 2)."""
+        """Camera coordinates (..., 2) of columns and rows (..., 2)."""
         return np.asarray((self.x_mm, self.y_mm) + pixels * (self.pitch_mm, -self.pitch_mm))
 
     def pixel_from_camera(self, places_mm: Array) -> Array:
@@ -115,8 +115,7 @@ class Canvas:
 
     def camera_mm(self, col: Array, row: Array) -> Array:
         """Camera coordinates (rows, cols, 2) of columns (cols,) and rows (rows,)."""
-        x, y = np.meshgrid(self.x_mm + self.pitch_mm * col, self.y_mm - self.pitch_mm * row)
-        return np.stack([x, y], axis=-1)
+        return self.camera_from_pixel(np.stack(np.meshgrid(col, row), axis=-1))
 
 
 def outline_canvas(scans: Sequence[tuple[FrameChain, Window]], pitch_mm: float) -> Canvas:

@@ -156,7 +156,7 @@ def place_frame(
         if pitch_um is None:
             pixel_mm = pixel_mm / linear_scale(up)
             up, source = up / linear_scale(up), "the coordinates of the marks"
-        return FramePlacement(_FLIP @ up / pixel_mm[:, None], _pair(1000.0 * pixel_mm), source)
+        return FramePlacement(_FLIP @ up / pixel_mm[:, None], as_point(1000.0 * pixel_mm), source)
     if pitch_um is None:
         raise InputError(_NO_PITCH)
     linear = _FLIP @ UP_FROM_CAMERA[drawing.pose] / (np.array(pitch_um)[:, None] / 1000.0)
@@ -206,7 +206,7 @@ def rotation(angle_rad: float) -> Array:
     return np.array([[c, -s], [s, c]])
 
 
-def _pair(values: Array) -> Point:
+def as_point(values: Array) -> Point:
     return float(values[0]), float(values[1])
 
 
@@ -215,7 +215,7 @@ def frame_size_mm(drawing: CameraDrawing, placement: FramePlacement) -> Point | 
     if drawing.given_frame_mm or len(drawing.corners_px) != 2:
         return drawing.given_frame_mm
     first, second = (np.array(placement.camera_mm(px)) for px in drawing.corners_px)
-    return _pair(np.abs(second - first).round(1))
+    return as_point(np.abs(second - first).round(1))
 
 
 def camera_content(drawing: CameraDrawing, placement: FramePlacement) -> dict[str, Any]:

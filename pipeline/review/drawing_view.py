@@ -353,7 +353,9 @@ def handles(mark: MarkJson, toward: Point = (1.0, 1.0)) -> Iterator[Handle]:
         yield Handle(key, (half, half), lambda place: _changed(mark, key, max(2 * np.abs(place).max(), _LEAST_MM)))
     for at, vertex in enumerate(mark.get("vertices_mm", ())):
         yield Handle(
-            f"vertices_mm.{at}", _point(vertex), partial(_drag_item, mark, "vertices_mm", at, np.ndarray.tolist)
+            f"vertices_mm.{at}",
+            camera_drawing.as_point(vertex),
+            partial(_drag_item, mark, "vertices_mm", at, np.ndarray.tolist),
         )
     for at, part in enumerate(mark.get("part", ())):
         for one in handles(part):
@@ -436,10 +438,6 @@ def _unit(angle_deg: float) -> Array:
     return np.array([math.cos(angle), math.sin(angle)])
 
 
-def _point(place: Array) -> Point:
-    return float(place[0]), float(place[1])
-
-
 def _length(
     mark: MarkJson, key: str, angle_deg: float, factor: float = 1.0, offset: float = 0.0, side: Array | None = None
 ) -> Handle:
@@ -450,11 +448,11 @@ def _length(
         value = factor * (float(along @ (place - start)) - offset)
         return _changed(mark, key, max(value, 0.0 if key in ("gap_mm", "reach_mm") else _LEAST_MM))
 
-    return Handle(key, _point(start + along * (offset + mark.get(key, 0.0) / factor)), dragged)
+    return Handle(key, camera_drawing.as_point(start + along * (offset + mark.get(key, 0.0) / factor)), dragged)
 
 
 def _place(mark: MarkJson, key: str) -> Handle:
-    return Handle(key, _point(mark[key]), lambda place: _changed(mark, key, place.tolist()))
+    return Handle(key, camera_drawing.as_point(mark[key]), lambda place: _changed(mark, key, place.tolist()))
 
 
 def _changed(mark: MarkJson, key: str, value: Any) -> MarkJson:
@@ -476,4 +474,4 @@ def _cross(mark: MarkJson) -> Iterator[Handle]:
     yield _length(mark, "arm_mm", angle)
     yield _length(mark, "line_mm", angle + 90.0, 2.0, side=_unit(angle) * _LINE_AT * mark["arm_mm"])
     yield _length(mark, "gap_mm", angle + 90.0)
-    yield Handle("angle_deg", _point(-_unit(angle) * mark["arm_mm"]), turned)
+    yield Handle("angle_deg", camera_drawing.as_point(-_unit(angle) * mark["arm_mm"]), turned)
