@@ -21,9 +21,10 @@ from matplotlib.figure import Figure
 import synthetic_images
 from adjust.problem.parameter import Parameter
 from benchmarks.harness import table
-from pipeline.design.expected import INTERIOR, UM_PER_MM, alone, expect, gains, rms
+from pipeline.design.expected import INTERIOR, alone, expect, gains, rms
 from pipeline.design.sweeps import Swept, Variations, over_layouts, sweep
 from pipeline.rendered.scene_tables import Sweep
+from pipeline.results.image_unit import UM_PER_MM
 
 Row = Sequence[str | float]
 

@@ -119,7 +119,7 @@ def compare(
     if len(when) != len(calibrations) or not (np.diff(when) > 0).all():
         raise AdjustmentError(f"{len(calibrations)} calibrations need as many times, in rising order, not {when}.")
     shared = tuple(id for id in calibrations[0].fiducials if all(id in each.fiducials for each in calibrations))
-    across, along = (np.linspace(*ends, _GRID) for ends in np.transpose(corners_mm))
+    across, along = np.linspace(corners_mm[0], corners_mm[1], _GRID).T
     places = np.stack(np.meshgrid(across, along), axis=-1).reshape(-1, 2)
     views = [_view(each, calibrations[0], places, shared, use) for each in calibrations]
     redundancies = [each.redundancy for each in calibrations if each.redundancy > 0.0]

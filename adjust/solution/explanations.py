@@ -34,11 +34,12 @@ from scipy.spatial import KDTree
 from scipy.special import chdtr, chdtrc, fdtrc, ndtr
 
 from adjust.array_types import Array, Indices, Mask
+from adjust.functional_model.distortion_models import UM_PER_MM
 from adjust.problem.problem import Problem
 from adjust.quality.cofactor import free_cofactor
 from adjust.quality.critical_values import Probabilities
 from adjust.quality.reliability import TOLD_APART, Snooping
-from adjust.quality.run import UM_PER_MM, GrossError, Run, residuals
+from adjust.quality.run import GrossError, Run, residuals
 from adjust.quality.variance_components import added_variance, refined_factors
 from adjust.rank_defect.diagnosis import singular_directions
 from adjust.solution.model_hypotheses import Estimate, ModelHypothesis, continued, model_hypotheses, wrong_points

@@ -19,6 +19,7 @@ from scipy.special import chdtrc
 from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.board import BoardForm, board_form, disk_directions, strain_directions
 from adjust.functional_model.correction import AFFINITY_TERMS, ZERO, PolynomialTerms, Term, decentering, radial
+from adjust.functional_model.distortion_models import UM_PER_MM
 from adjust.functional_model.families import family
 from adjust.functional_model.lens import INTERIOR_NAMES, Prior
 from adjust.functional_model.scanner import is_left
@@ -29,7 +30,7 @@ from adjust.problem.network import Approximations, Board, Network, Scanner, Tran
 from adjust.problem.parameter import shortened
 from adjust.problem.problem import Problem, State, number
 from adjust.quality.cofactor import free_cofactor
-from adjust.quality.run import UM_PER_MM, Run, freed
+from adjust.quality.run import Run, freed
 from adjust.solution.partitions import (
     Selection,
     displaced_points,

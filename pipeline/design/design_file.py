@@ -12,6 +12,7 @@ import numpy as np
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.network import EXTERIOR_NAMES, Image
+from adjust.problem.observations import ObservationKind
 from adjust.problem.parameter import Parameter
 from pipeline.design.expected import Alternative, Expected, error_unit, rms
 from pipeline.design.sweeps import Layouts, Swept
@@ -112,7 +113,7 @@ def _camera(expected: Expected) -> Content:
     }
 
 
-def _image(expected: Expected, image: Image, counts: Mapping[tuple[str, str], int]) -> Content:
+def _image(expected: Expected, image: Image, counts: Mapping[tuple[str, ObservationKind], int]) -> Content:
     """Image; counts: of observations by image and kind."""
     film = {name: Parameter.film(image.name, name) for name in film_parameter_names(image.transformation)}
     exterior = {name: Parameter.exterior(image.name, name) for name in EXTERIOR_NAMES}

@@ -106,7 +106,7 @@ def test_equations_that_are_singular_in_digits_are_damped(monkeypatch: pytest.Mo
 
     class Singular(Factor):
         @property
-        def solution(self) -> NDArray[np.float64]:  # type: ignore[override]
+        def solution(self) -> NDArray[np.float64]:
             raise np.linalg.LinAlgError("singular")
 
     network, start = nets.simulated(np.random.default_rng(1))

@@ -18,7 +18,7 @@ from reference_cases import CASES, case_network, load
 from studies import parametrize_with_studies
 from test_condition_equations import BENDS_MM, bent_board, make_network
 
-from adjust import Adjustment, Distortion, Parameter, Prior
+from adjust import Adjustment, Distortion, Network, Parameter, Prior, adjust
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.problem.network import EXTERIOR_NAMES, Transformation
@@ -373,16 +373,16 @@ def test_eccentricities_are_corrected_where_a_round_leaves_out_an_image(
     path = write_network(simulated, tmp_path)
     path.write_text(path.read_text() + '[targets]\nkind = "disk"\ndiameter_mm = 30000.0\n')
     project = read_project(path)
-    marks, every = read_comparator(project.comparator), adjust_stage.adjust
+    marks = read_comparator(project.comparator)
     expected = adjust_marks(project, [mark for mark in marks if mark.image != "f3"])
-    rounds = list[nets.Network]()
+    rounds = list[Network]()
 
-    def without_f3(network: nets.Network, **options: Any) -> Adjustment:
+    def without_f3(network: Network, **options: Any) -> Adjustment:
         rounds.append(network)
         rest = [row for row, image in enumerate(network.observations.image) if image != "f3"]
         images = tuple(image for image in network.images if image.name != "f3")
         left = replace(network, images=images, observations=network.observations.only(np.array(rest)))
-        return every(network if len(rounds) == 1 else left, **options)
+        return adjust(network if len(rounds) == 1 else left, **options)
 
     monkeypatch.setattr(adjust_stage, "adjust", without_f3)
     found = adjust_marks(project, marks)

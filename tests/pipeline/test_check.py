@@ -314,11 +314,9 @@ def test_parameters_that_cannot_be_separated_are_not_compared_one_by_one() -> No
 
 def test_radial_terms_alone_that_cannot_be_separated_leave_nothing_to_compare(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Adjustment, "inseparable", lambda *_: ["k1", "k2"])
-    network = nets.lens_network("opencv", np.random.default_rng(3))
-    c, x0, y0 = (Prior(value, 0.0) for value in (nets.LENSES["opencv"][0], 0.0, 0.0))
-    observations = network.observations.only(np.arange(0, len(network.observations), 15))
-    radial, network = free("opencv", "k1", "k2"), replace(network, observations=observations)
-    camera = replace(network.cameras[0], principal_distance_mm=c, x0_mm=x0, y0_mm=y0, distortion=radial)
-    check = check_against_opencv(adjust(replace(network, cameras=(camera,)))).cameras["L"]
+    network = simulated(nets.CONVERGENT_STATIONS, film=False)
+    known = (Prior(nets.PROJECTED_C_MM, 0.0), Prior(0.0, 0.0), Prior(0.0, 0.0))
+    camera = Camera("rc20", *known, free("opencv", "k1", "k2"))
+    check = check_network(replace(network, cameras=(camera,)))
     assert check.verdict == "not possible"
     assert "k1 and k2 cannot be separated, and nothing else is free" in check.reason
