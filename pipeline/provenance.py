@@ -16,7 +16,7 @@ import numpy as np
 from measure.errors import MissingError, UnreachableError
 from measure.results import MEASURE_REVISION
 from measure.scans.remote import Address, whole_file
-from pipeline.text.files import read_bytes
+from pipeline.text.files import regular_file
 
 _PLAIN = {str, int, bool, type(None)}  # types of most values, tested first
 NO_FINGERPRINT = {"fingerprint": False}  # metadata of a field that is not part of a value's fingerprint
@@ -53,8 +53,9 @@ def hash_text(text: str) -> str:
 
 
 def hash_file(path: Path) -> str:
-    """SHA-256 of a file."""
-    return hash_content(read_bytes(path))
+    """SHA-256 of a file of any size. Raises as `regular_file` does."""
+    with regular_file(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _json(value: Any) -> Any:

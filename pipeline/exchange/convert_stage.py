@@ -34,7 +34,7 @@ from pipeline.results.adjustment_record import (
     Quantity,
 )
 from pipeline.results.record_json import json_text, record_content
-from pipeline.text.files import read_bytes
+from pipeline.text.files import RESULT_MB, read_bytes
 from pipeline.text.wording import did_you_mean, listed
 from pipeline.types import Array
 
@@ -170,7 +170,7 @@ def _converted_adjustment(path: Path, options: ConvertOptions) -> Conversion:
     converted = replace(content, cameras={**content.cameras, name: entry}, correlations=correlations)
     text = "".join(json_text(converted))
     arrays = io.BytesIO()
-    with np.load(io.BytesIO(read_bytes(covariance_path(path))), allow_pickle=False) as stored:
+    with np.load(io.BytesIO(read_bytes(covariance_path(path), RESULT_MB)), allow_pickle=False) as stored:
         kept = {key: stored[key] for key in stored.files}
     kept |= moved.arrays()
     kept["fingerprint"] = np.array(hash_content(text.encode("utf-8")))

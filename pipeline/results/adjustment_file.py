@@ -20,10 +20,11 @@ from pipeline.provenance import hash_file
 from pipeline.results.adjustment_content import adjustment_record, covariance_arrays
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.record_json import json_text, read_record
-from pipeline.text.files import MOST_MB, FilePath, atomic_path, read_bytes
+from pipeline.text.files import RESULT_MB, FilePath, atomic_path, read_bytes
 from pipeline.types import Array
 
 AGAIN = "Run `reseau adjust` again; it writes both files."
+_ARRAY_MB = 600  # names of the parameters of 50,000 images, of 80 letters each, have 190
 
 
 @dataclass(frozen=True)
@@ -158,7 +159,7 @@ def read_covariance(path: Path) -> ParameterCovariance:
     """Read the covariance of the `adjustment.json` at `path`. Raises InputError if it is missing or damaged."""
     file = covariance_path(path)
     try:
-        data = read_bytes(file)
+        data = read_bytes(file, RESULT_MB)
     except (FileNotFoundError, IsADirectoryError):
         raise InputError(f"{file}: there is no such file; it goes with {path.name}. {AGAIN}") from None
     values = _array(data, "values", file)
@@ -222,10 +223,10 @@ def read_own_covariance(path: Path) -> ParameterCovariance:
 
 
 def _array(data: bytes, name: str, file: Path) -> NDArray[Any]:
-    """Read an array of an npz file, limited to the size allowed for any file."""
+    """Read an array of an npz file, of limited size."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive, archive.open(f"{name}.npy") as member:
-            unpacked = io.BytesIO(member.read(MOST_MB * 1_000_000))
+            unpacked = io.BytesIO(member.read(_ARRAY_MB * 1_000_000))
         return np.asarray(np.lib.format.read_array(unpacked, allow_pickle=False))
     except Exception as error:  # zipfile, zlib and numpy raise various errors for a damaged file
         raise InputError(f"{file}: is not a covariance file ({name}: {error}). {AGAIN}") from None

@@ -17,7 +17,7 @@ from adjust.problem.observations import ObservationKind
 from measure.flags import Status
 from pipeline.errors import InputError
 from pipeline.text.csv_table import Row, csv_line, read_csv
-from pipeline.text.files import SMALLEST_SIGMA, FilePath, atomic_path, image_name, read_bytes
+from pipeline.text.files import RESULT_MB, SMALLEST_SIGMA, FilePath, atomic_path, image_name, read_bytes
 from pipeline.types import Array
 
 COLUMNS = (
@@ -164,7 +164,7 @@ def describe_decisions(decided: Mapping[CameraPerson, int]) -> str:
 
 def read_pitches(path: Path) -> dict[str, tuple[float, float]]:
     """Read the pixel pitch by image, µm across and down, from the lines above the table."""
-    text = read_bytes(path).decode("utf-8", "replace")
+    text = read_bytes(path, RESULT_MB).decode("utf-8", "replace")
     pitches = {}
     for found in _PITCH.finditer(text):
         image, *given = found.groups()
@@ -192,7 +192,7 @@ def read_comparator(path: FilePath, pitch_um: tuple[float, float] | None = None)
         Names the line of a duplicate mark, an unknown kind, an invalid number, or a mark with neither mm nor pixels.
     """
     points: dict[tuple[str, str, str], ComparatorPoint] = {}
-    for row in read_csv(path, COLUMNS[:2], COLUMNS[2:] + PIXEL_SIGMAS):
+    for row in read_csv(path, COLUMNS[:2], COLUMNS[2:] + PIXEL_SIGMAS, RESULT_MB):
         point = _point(row, pitch_um)
         key = (point.image, point.point, "fiducial" if point.kind == "fiducial" else "object")
         if key in points:
@@ -208,7 +208,7 @@ def read_comparator(path: FilePath, pitch_um: tuple[float, float] | None = None)
 
 def has_pixels_alone(path: Path) -> bool:
     """Whether a comparator file has pixel columns but no mm columns. Raises InputError if it has neither."""
-    row = next(read_csv(path, COLUMNS[:2], COLUMNS[2:] + PIXEL_SIGMAS), None)
+    row = next(read_csv(path, COLUMNS[:2], COLUMNS[2:] + PIXEL_SIGMAS, RESULT_MB), None)
     return row is not None and _has_pixels_alone(row)
 
 

@@ -20,7 +20,7 @@ import pydantic
 
 from adjust.problem.parameter import Parameter, parameter_from_text
 from pipeline.errors import InputError
-from pipeline.text.files import parse_json, quote_value, read_bytes, write_atomically
+from pipeline.text.files import RESULT_MB, parse_json, quote_value, read_bytes, write_atomically
 from pipeline.text.table_models import MANY_KEYS, name_in_file
 from pipeline.text.toml_tables import list_words
 from pipeline.text.wording import LISTED
@@ -138,7 +138,7 @@ def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
     Raises FileNotFoundError and IsADirectoryError, and InputError if the file is not JSON or has an invalid value; the
     message names the place and the expected value.
     """
-    data = read_bytes(path)
+    data = read_bytes(path, RESULT_MB)
     try:
         record: Record = _adapter(kind).validate_json(data)
         return record

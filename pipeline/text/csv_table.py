@@ -12,7 +12,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import InputError
-from pipeline.text.files import LARGEST, SMALLEST_SIGMA, FilePath, no_such_file, quote_value, read_bytes, split_lines
+from pipeline.text.files import (
+    LARGEST,
+    MOST_MB,
+    SMALLEST_SIGMA,
+    FilePath,
+    no_such_file,
+    quote_value,
+    read_bytes,
+    split_lines,
+)
 from pipeline.text.wording import did_you_mean
 
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
@@ -87,12 +96,14 @@ def csv_line(cells: Sequence[str]) -> str:
     return ",".join(written)
 
 
-def read_csv(path: FilePath, required: Sequence[str], optional: Sequence[str] = ()) -> Iterator[Row]:
+def read_csv(
+    path: FilePath, required: Sequence[str], optional: Sequence[str] = (), most_mb: int = MOST_MB
+) -> Iterator[Row]:
     """Yield the rows of a CSV file. Raises InputError for a missing file, a missing or unknown column, or an incomplete
     line."""
     path = Path(path)
     try:
-        lines = enumerate(split_lines(read_bytes(path).decode("utf-8-sig")), 1)
+        lines = enumerate(split_lines(read_bytes(path, most_mb).decode("utf-8-sig")), 1)
     except FileNotFoundError:
         raise InputError(no_such_file(path)) from None
     except IsADirectoryError:

@@ -8,12 +8,13 @@ import stat
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from pipeline.errors import InputError, WriteError, what_to_do
 from pipeline.text.wording import nearest
 
-MOST_MB = 200  # MB; a comparator file of 50,000 scans has 50
+MOST_MB = 200  # MB; of what users write
+RESULT_MB = 2000  # MB; adjustment.json of 50,000 film frames has 415, comparator.csv with 100 tie points each 550
 SHOWN = 60  # characters of a wrong value quoted in a message
 
 _KINDS = {stat.S_ISFIFO: "a pipe", stat.S_ISCHR: "a device", stat.S_ISBLK: "a device", stat.S_ISSOCK: "a socket"}
@@ -28,11 +29,12 @@ def split_lines(text: str) -> list[str]:
     return re.findall(r"[^\r\n]*(?:\r\n?|\n)|[^\r\n]+", text)
 
 
-def read_bytes(path: Path, most_mb: int = MOST_MB) -> bytes:
-    """Read the content of a file.
+@contextmanager
+def regular_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a file for reading.
 
     Raises FileNotFoundError and IsADirectoryError, for which the caller has a better message, and InputError for a file
-    that is not regular (a pipe would block, a device has no end), too large, or unreadable.
+    that is not regular (a pipe would block, a device has no end) or unreadable.
     """
     try:
         found = path.stat()
@@ -42,11 +44,18 @@ def read_bytes(path: Path, most_mb: int = MOST_MB) -> bytes:
             kind = next((kind for is_kind, kind in _KINDS.items() if is_kind(found.st_mode)), "something else")
             raise InputError(f"{path}: is {kind}; a regular file is needed here. Copy its content into one.")
         with path.open("rb") as file:
-            data = file.read(most_mb * 1_000_000 + 1)
+            yield file
     except (FileNotFoundError, IsADirectoryError):
         raise
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error}).") from None
+
+
+def read_bytes(path: Path, most_mb: int = MOST_MB) -> bytes:
+    """Read the content of a file. Raises as `regular_file` does, and InputError for a file that is too large."""
+    with regular_file(path) as file:
+        size_mb = os.fstat(file.fileno()).st_size // 1_000_000
+        data = file.read(min(most_mb, max(MOST_MB, size_mb + 1)) * 1_000_000 + 1)  # reserves as much memory
     if len(data) > most_mb * 1_000_000:
         raise InputError(
             f"{path}: has more than {most_mb} MB, the most that such a file may have. Is it the right one?"

@@ -1,6 +1,7 @@
 """The user's files: what is right is read, what is wrong gets a message with file, line and the likely remedy."""
 
 import errno
+import hashlib
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -20,9 +21,12 @@ from pipeline.archive.measure_archive import check_measurable
 from pipeline.files.camera_file import camera_text, read_camera
 from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_file import Project, read_project
+from pipeline.provenance import hash_file
 from pipeline.rendered.scene_file import read_scene
+from pipeline.results import comparator_file, record_json
+from pipeline.results.adjustment_file import read_adjustment
 from pipeline.results.comparator_file import ComparatorPoint, read_comparator, read_pitches, write_comparator
-from pipeline.text.files import check_writable, write_atomically
+from pipeline.text.files import MOST_MB, RESULT_MB, check_writable, read_bytes, write_atomically
 from pipeline.text.toml_tables import read_toml
 
 CAMERA = """
@@ -290,6 +294,22 @@ def test_a_list_of_pixels_is_read_with_y_up_by_the_pitch(tmp_path: Path) -> None
     refused(read_comparator, nothing, ["lacks the columns x_mm, y_mm or col_px, row_px"])
     blank = written(tmp_path, "blank.csv", "image,point,col_px,row_px\nf,1,2,\n")
     refused(lambda path: read_comparator(path, (20.0, 10.0)), blank, ["column col_px: is blank"])
+
+
+def test_results_of_large_archives_are_larger_than_what_users_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "adjustment.json"
+    with path.open("wb") as file:
+        file.truncate((MOST_MB + 1) * 1_000_000)  # sparse
+    assert hash_file(path) == hashlib.sha256(bytes((MOST_MB + 1) * 1_000_000)).hexdigest()
+    with pytest.raises(InputError, match=f"more than {MOST_MB} MB"):
+        read_bytes(path)
+    assert len(read_bytes(path, RESULT_MB)) == (MOST_MB + 1) * 1_000_000
+    written(tmp_path, "comparator.csv", "image,point\n")
+    for module, read in ((record_json, read_adjustment), (comparator_file, read_comparator)):
+        monkeypatch.setattr(module, "RESULT_MB", 0)
+        refused(read, tmp_path / ("comparator.csv" if read is read_comparator else "adjustment.json"), ["than 0 MB"])
 
 
 def test_writing_is_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
