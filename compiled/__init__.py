@@ -9,7 +9,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-Doubles = NDArray[np.float64]
+Doubles, Singles = NDArray[np.float64], NDArray[np.float32]
 
 
 class Kernels(Protocol):
@@ -31,6 +31,42 @@ class Kernels(Protocol):
         Returns
         -------
         Number of values that were clamped to the range of the samples.
+        """
+        ...
+
+    def cover_cells(
+        self, start: Doubles, end: Doubles, first: NDArray[np.int64], covered: Singles, columns: int
+    ) -> None:
+        """Add the parts of a drawing to the covered fractions of cells.
+
+        Parameters
+        ----------
+        start, end : (n, 2) lines of the outlines, in cells, column first.
+        first : (parts + 1,) number of each part's first line.
+        covered : (rows, columns), added to.
+        """
+        ...
+
+    def blurred_images(
+        self,
+        sharp: Singles,
+        columns: int,
+        taps: Singles,
+        orders: int,
+        shift: tuple[int, int],
+        cells: int,
+        images: Singles,
+        width: int,
+    ) -> None:
+        """Blur cells to pixels.
+
+        Parameters
+        ----------
+        sharp : (rows, columns) cells, cells x cells to a pixel.
+        taps : (2, orders, taps) weights of cells along columns and rows, by the order of the derivative.
+        shift : column and row of the cell on which the first tap of the first pixel falls.
+        images : (1 or 6, height, width), added to: the value, or it and its derivatives by column, row, column twice,
+            both, row twice.
         """
         ...
 

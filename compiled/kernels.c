@@ -738,7 +738,176 @@ static PyObject *whiten_rows(PyObject *module, PyObject *args)
     Py_RETURN_NONE;
 }
 
+/* Cells of the bounding box of one part of a drawing: the sum of each row up to a cell is the area covered in it. */
+typedef struct {
+    double *areas;
+    Py_ssize_t row, column, tall, wide, rows, columns;
+} Box;
+
+static Py_ssize_t within(Py_ssize_t index, Py_ssize_t size)
+{
+    return index < 0 ? 0 : index < size ? index : size - 1;
+}
+
+/* Cut a line of an outline at the rows (axis 1) and columns (axis 0) of cells, and add the area right of each piece. */
+static void add_line(Box *box, const double *start, const double *end, int axis)
+{
+    double first = floor(start[axis]), along = end[axis] - start[axis], from[2] = {start[0], start[1]}, to[2];
+    Py_ssize_t pieces = (Py_ssize_t)fabs(floor(end[axis]) - first) + 1;
+    for (Py_ssize_t i = 1; i <= pieces; i++) {
+        to[0] = end[0], to[1] = end[1];
+        if (i < pieces) {
+            double crossing = first + (double)(along >= 0.0 ? i : 1 - i), share = (crossing - start[axis]) / along;
+            to[!axis] = start[!axis] + share * (end[!axis] - start[!axis]);
+            to[axis] = crossing;
+        }
+        double tall = to[1] - from[1], middle = (from[0] + to[0]) / 2.0;
+        Py_ssize_t row = (Py_ssize_t)floor((from[1] + to[1]) / 2.0), column = (Py_ssize_t)floor(middle);
+        if (axis) {
+            add_line(box, from, to, 0);
+        } else if (row >= 0 && row < box->rows && column < box->columns) {
+            double own = tall * (column < 0 ? 1.0 : (double)column + 1.0 - middle), *cell = box->areas;
+            cell += within(row - box->row, box->tall) * (box->wide + 1) + within(column - box->column, box->wide);
+            cell[0] += own;
+            cell[1] += tall - own;
+        }
+        from[0] = to[0], from[1] = to[1];
+    }
+}
+
+/* cover_cells(start, end, first, covered, columns) -> None
+ *
+ * Add the parts of a drawing to the covered fractions (rows, columns) of cells, single precision. start, end (n, 2):
+ * lines of the outlines, column first; first (parts + 1): number of each part's first line.
+ */
+static PyObject *cover_cells(PyObject *module, PyObject *args)
+{
+    Py_buffer start, end, first, covered;
+    Py_ssize_t columns;
+    if (!PyArg_ParseTuple(args, "y*y*y*w*n", &start, &end, &first, &covered, &columns))
+        return NULL;
+    Py_ssize_t parts = first.len / (Py_ssize_t)sizeof(int64_t) - 1, width = columns > 0 ? columns : 1;
+    Py_ssize_t rows = covered.len / (Py_ssize_t)sizeof(float) / width;
+    const int64_t *line = first.buf;
+    double *areas = malloc(sizeof(double) * (size_t)(rows * (width + 1) + 1));
+    int fits = areas && columns > 0 && start.len == end.len && parts >= 0 && rows * width * 4 == covered.len &&
+               line[parts] * 16 == start.len;
+    for (Py_ssize_t part = 0; fits && part < parts; part++) {
+        double least[2] = {INFINITY, INFINITY}, most[2] = {-INFINITY, -INFINITY};
+        const double *from = (const double *)start.buf + 2 * line[part], *to = (const double *)end.buf + 2 * line[part];
+        Py_ssize_t count = line[part + 1] - line[part];
+        for (Py_ssize_t i = 0; i < 2 * count; i++) {
+            least[i % 2] = fmin(least[i % 2], from[i]);
+            most[i % 2] = fmax(most[i % 2], from[i]);
+        }
+        if (!(most[0] >= least[0] && least[0] < (double)width && least[1] < (double)rows && most[1] >= 0.0))
+            continue;
+        Box box = {areas, (Py_ssize_t)fmax(floor(least[1]), 0.0), (Py_ssize_t)fmax(floor(least[0]), 0.0), 0, 0, rows, width};
+        box.tall = (Py_ssize_t)fmin(floor(most[1]) + 1.0, (double)rows) - box.row;
+        box.wide = (Py_ssize_t)fmax(fmin(floor(most[0]) + 1.0, (double)width) - (double)box.column, 1.0);
+        memset(areas, 0, sizeof(double) * (size_t)(box.tall * (box.wide + 1)));
+        for (Py_ssize_t i = 0; i < count; i++)
+            add_line(&box, from + 2 * i, to + 2 * i, 1);
+        for (Py_ssize_t row = 0; row < box.tall; row++) {
+            float *about = (float *)covered.buf + (box.row + row) * width + box.column;
+            double area = 0.0;
+            for (Py_ssize_t column = 0; column < box.wide; column++) {
+                area += areas[row * (box.wide + 1) + column];
+                about[column] += (float)((1.0f - about[column]) * fmin(fabs(area), 1.0));
+            }
+        }
+    }
+    free(areas);
+    PyBuffer_Release(&start);
+    PyBuffer_Release(&end);
+    PyBuffer_Release(&first);
+    PyBuffer_Release(&covered);
+    if (!fits) {
+        PyErr_SetString(PyExc_ValueError, "the sizes of lines, parts and cells do not go together");
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
+/* Quotient rounded down. */
+static Py_ssize_t quotient(Py_ssize_t number, Py_ssize_t by)
+{
+    return number / by - (number % by < 0);
+}
+
+/* blurred_images(sharp, columns, taps, shift, cells, images, width) -> None
+ *
+ * Blur cells (rows, columns) to images (1 or 6, height, width) in pixels of cells x cells: the value, or it and its
+ * derivatives by column, row, column twice, both, row twice. taps (2, orders, taps): weights of cells along columns and
+ * rows; shift (2): first cell that a tap of the window's first pixel falls on, (column, row). All in single precision.
+ */
+static PyObject *blurred_images(PyObject *module, PyObject *args)
+{
+    static const int orders_by_column[6] = {0, 1, 0, 2, 1, 0}, orders_by_row[6] = {0, 0, 1, 0, 1, 2};
+    Py_buffer sharp, taps, images;
+    Py_ssize_t columns, shift[2], cells, width, orders;
+    if (!PyArg_ParseTuple(args, "y*ny*n(nn)nw*n", &sharp, &columns, &taps, &orders, shift, shift + 1, &cells, &images,
+                          &width))
+        return NULL;
+    int fits = columns > 0 && (orders == 1 || orders == 3) && cells > 0 && width > 0, number = orders == 3 ? 6 : 1;
+    Py_ssize_t rows = fits ? sharp.len / 4 / columns : 0, height = fits ? images.len / 4 / number / width : 0;
+    Py_ssize_t reach = fits ? taps.len / 8 / orders : 0;
+    float *line = malloc(sizeof(float) * (size_t)(3 * (width > 0 ? width : 1)));
+    float *along = calloc((size_t)(4 * reach + 16), sizeof(float)); /* (taps, 4): orders beside each other, for vectors */
+    float *padded = calloc((size_t)(fits ? columns : 0) + 4, sizeof(float)); /* a row of cells */
+    fits = fits && line && along && padded && rows * columns * 4 == sharp.len && reach * orders * 8 == taps.len &&
+           height * width * number * 4 == images.len;
+    for (Py_ssize_t i = 0; fits && i < reach * orders; i++)
+        along[4 * (i % reach) + i / reach] = ((const float *)taps.buf)[i];
+    for (Py_ssize_t row = 0; row < rows && fits; row++) {
+        const float *cell = (const float *)sharp.buf + row * columns, *tap = (const float *)taps.buf + orders * reach;
+        Py_ssize_t begin = 0, end = columns;
+        while (begin < columns && cell[begin] == 0.0f)
+            begin++;
+        while (end > begin && cell[end - 1] == 0.0f)
+            end--;
+        Py_ssize_t left = quotient(begin - shift[0] - reach, cells) + 1, right = quotient(end - 1 - shift[0], cells) + 1;
+        Py_ssize_t top = quotient(row - shift[1] - reach, cells) + 1, bottom = quotient(row - shift[1], cells) + 1;
+        left = left > 0 ? left : 0, right = right < width ? right : width;
+        top = top > 0 ? top : 0, bottom = bottom < height ? bottom : height;
+        if (begin == end || left >= right || top >= bottom)
+            continue;
+        memcpy(padded, cell, sizeof(float) * (size_t)columns);
+        for (Py_ssize_t pixel = left; pixel < right; pixel++) {
+            Py_ssize_t at = pixel * cells + shift[0], from = begin > at ? begin : at;
+            Py_ssize_t to = end < at + reach ? end : at + reach;
+            float sum[16] = {0.0f};
+            for (Py_ssize_t i = from; i < to; i += 4) /* four sums of each, which need not wait for one another */
+                for (int order = 0; order < 16; order++)
+                    sum[order] += along[4 * (i - at) + order] * padded[i + order / 4];
+            for (Py_ssize_t order = 0; order < orders; order++)
+                line[order * width + pixel] = sum[order] + sum[order + 4] + sum[order + 8] + sum[order + 12];
+        }
+        for (Py_ssize_t pixel = top; pixel < bottom; pixel++)
+            for (int i = 0; i < number; i++) {
+                float weight = tap[orders_by_row[i] * reach + row - pixel * cells - shift[1]];
+                const float *source = line + orders_by_column[i] * width;
+                float *image = (float *)images.buf + (i * height + pixel) * width;
+                for (Py_ssize_t column = left; column < right; column++)
+                    image[column] += weight * source[column];
+            }
+    }
+    free(line);
+    free(along);
+    free(padded);
+    PyBuffer_Release(&sharp);
+    PyBuffer_Release(&taps);
+    PyBuffer_Release(&images);
+    if (!fits) {
+        PyErr_SetString(PyExc_ValueError, "the sizes of cells, taps and images do not go together");
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
 static PyMethodDef methods[] = {
+    {"cover_cells", cover_cells, METH_VARARGS, "Areas of cells that a drawing covers."},
+    {"blurred_images", blurred_images, METH_VARARGS, "Blurred image of a drawing and its derivatives."},
     {"target_rays", target_rays, METH_VARARGS, "Rays of object points in images."},
     {"target_derivatives", target_derivatives, METH_VARARGS, "Derivatives of images by orientations and points."},
     {"whiten_rows", whiten_rows, METH_VARARGS, "Pairs of rows of unit weight."},

@@ -20,9 +20,12 @@ from adjust.linear_algebra.normal_equations import SharedEquations, SparseRows, 
 from adjust.linear_algebra.sparse_factor import Triangle
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
+from measure.marks import rendering
+from measure.marks.shapes import Disk, MarkShape, Polygon, cross, ring_cross
 from pipeline.cli import DONE, run
 from pipeline.resampling.resample_stage import Degree, spline_samples
 
+WEDGE = MarkShape((Polygon(((0.0, 0.0), (0.9, 0.2), (0.8, 0.6))), Disk((-0.4, 0.1), 0.3)))
 needs_kernels = pytest.mark.skipif(compiled.kernels is None, reason=NO_COMPILER)
 Samples = NDArray[np.uint8 | np.uint16]
 
@@ -72,6 +75,42 @@ def test_buffers_of_other_sizes_are_refused() -> None:
     for degree, out in ((4, samples), (5, np.zeros(4)), (5, np.zeros(3, np.uint16))):
         with pytest.raises(ValueError, match="do not go together"):
             call(coefficients, 9, at, at, degree, out)
+
+
+@needs_kernels
+@pytest.mark.parametrize("blur_px", [0.0, 0.4, 2.0])
+@pytest.mark.parametrize("mark", [MarkShape(cross(0.9, 0.05)), MarkShape(ring_cross(0.4, 0.1, 0.7, 0.1)), WEDGE])
+@pytest.mark.parametrize("place_px", [(40.3, 44.8), (2.1, 80.7), (-30.0, 30.0), (-300.0, 30.0)])
+def test_drawings(
+    mark: MarkShape, place_px: tuple[float, float], blur_px: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whole in the window, cut off by its border, and outside of it."""
+    place = np.column_stack([np.array([[40.0, 11.0], [9.0, -41.0]]), place_px])
+    rendering._sharp_cells.cache_clear()
+    cells, shown = (
+        rendering.cell_coverage(mark, np.abs(place), 90, 85, 3),
+        rendering.render(mark, place, 90, 85, blur_px),
+    )
+    monkeypatch.setattr(compiled, "kernels", None)
+    rendering._sharp_cells.cache_clear()
+    np.testing.assert_allclose(cells, rendering.cell_coverage(mark, np.abs(place), 90, 85, 3), rtol=0, atol=1e-6)
+    expected = rendering.render(mark, place, 90, 85, blur_px)
+    for name, image in vars(expected).items():
+        np.testing.assert_allclose(getattr(shown, name), image, rtol=0, atol=2e-6 * np.abs(image).max(), err_msg=name)
+
+
+@needs_kernels
+def test_drawings_of_other_sizes_are_refused() -> None:
+    assert compiled.kernels is not None
+    line, first, cells = np.zeros((4, 2)), np.array([0, 4]), np.zeros((6, 8), np.float32)
+    taps, images = np.zeros((2, 3, 5), np.float32), np.zeros((6, 3, 4), np.float32)
+    for lines in ((line, line[1:], first, cells, 8), (line, line, first[:1], cells, 8), (line, line, first, cells, 9)):
+        with pytest.raises(ValueError, match="do not go together"):
+            compiled.kernels.cover_cells(*lines)
+    compiled.kernels.blurred_images(cells, 8, taps, 3, (0, 0), 2, images, 4)
+    for columns, orders, width in ((9, 3, 4), (8, 2, 4), (8, 3, 5)):
+        with pytest.raises(ValueError, match="do not go together"):
+            compiled.kernels.blurred_images(cells, columns, taps, orders, (0, 0), 2, images, width)
 
 
 @pytest.mark.parametrize("there", [True, False])

@@ -17,7 +17,7 @@ from pipeline.cli import GROUPS
 ROOT = Path(__file__).parents[1]
 PACKAGES = {"measure", "adjust", "compiled", "pipeline", "synthetic_images", "reseau"}
 ALLOWED = {
-    "measure": set[str](),
+    "measure": {"compiled"},
     "adjust": {"compiled"},
     "compiled": set[str](),
     "synthetic_images": set[str](),

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import ArrayLike
 
+import compiled
 from measure.array_types import Array, Indices, Mask, Single
 from measure.geometry import Affine, linear_scale
 from measure.marks.shapes import (
@@ -207,6 +208,12 @@ def _blurred_derivatives(
         drawing = _drawing(mark, place, blur_px, cells)
     cells, most = drawing.cells, np.max(orders, axis=0)
     along = [_Average(blur_px, cells, shift, int(order)) for shift, order in zip(drawing.shift_px, most, strict=True)]
+    if compiled.kernels is not None:
+        pixels, sharp = np.zeros((len(orders), *size[::-1]), np.float32), np.ascontiguousarray(drawing.sharp)
+        taps = np.stack([each.taps for each in along])
+        col, row = (np.array([each.first for each in along]) - cells * drawing.first).tolist()
+        compiled.kernels.blurred_images(sharp, sharp.shape[1], taps, len(taps[0]), (col, row), cells, pixels, size[0])
+        return list(pixels)
     # Compute only the part of the window that the blurred mark reaches; the rest is zero.
     spare = int(np.ceil(along[0].reach / cells)) + 1
     low = np.maximum(drawing.first - spare, 0)
@@ -359,15 +366,20 @@ def cell_coverage(shape: MarkShape, pixel_from_mark: Array, width: int, height: 
     outlines = [_outlines(part, cell_from_mark) for part in shape.parts]
     corners = np.concatenate([outline for own in outlines for outline in own])
     ends = np.concatenate([np.roll(outline, -1, axis=0) for own in outlines for outline in own])
-    part_of = np.repeat(np.arange(len(outlines)), [sum(map(len, own)) for own in outlines])
+    counts = [sum(map(len, own)) for own in outlines]
     start, end = (
         shape.perspective_places(places) @ cell_from_mark[:, :2].T + cell_from_mark[:, 2] for places in (corners, ends)
     )
+    covered = np.zeros((height * cells, width * cells), np.float32)
+    if compiled.kernels is not None:
+        first = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+        compiled.kernels.cover_cells(start, end, first, covered, width * cells)
+        return covered
+    part_of = np.repeat(np.arange(len(outlines)), counts)
     for axis in (1, 0):  # cut at the cell borders: each piece lies within one cell
         start, end, part_of = _split(start, end, part_of, axis)
     tall, middle = end[:, 1] - start[:, 1], (start + end) / 2
     col, row = np.floor(middle).astype(np.intp).T
-    covered = np.zeros((height * cells, width * cells), np.float32)
     bounds = np.searchsorted(part_of, np.arange(len(outlines) + 1)).tolist()
     for own in (slice(*pair) for pair in pairwise(bounds)):
         _add(covered, row[own], col[own], tall[own], middle[own, 0])
