@@ -9,7 +9,8 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-Doubles, Singles = NDArray[np.float64], NDArray[np.float32]
+Doubles = NDArray[np.float64]
+Singles = NDArray[np.float32]
 
 
 class Kernels(Protocol):

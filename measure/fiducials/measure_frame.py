@@ -358,7 +358,9 @@ def largest_sigma_px(covariance_px2: Array) -> float:
 
 def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
     """Measure a frame from its placement."""
-    return refit_frame(fit_lines_and_sharpening(detect_frame(scan, layout, placement, options)))
+    frame = detect_frame(scan, layout, placement, options)
+    # A sharpening that is known by then is not estimated again: amount and radius trade off, and the marks hardly move.
+    return refit_frame(frame if frame.scan.tone.sharpening.is_determined else fit_lines_and_sharpening(frame))
 
 
 def detect_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:

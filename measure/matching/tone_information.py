@@ -79,7 +79,7 @@ def sharpening_score(fit: PictureFit, linear: LinearFit, by_width: Array) -> Sha
     priors_dn2 = model.prior_weights * linear.noise.variance_dn2
     score, _, covariance = _score(linear, changes, priors_dn2, model.departures, by_width)
     covariance += np.diag(_least_variances(linear, changes))
-    return SharpeningScore(score.value, score.normal, covariance, _moved_px(linear, halos))
+    return SharpeningScore(score.value, score.normal, covariance, _moved_px(linear, halos), tone.sharpening)
 
 
 def _has_contrast(drawn: Array) -> bool:

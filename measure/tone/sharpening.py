@@ -64,6 +64,12 @@ class Sharpening:
         return self.amount > 0
 
     @property
+    def is_determined(self) -> bool:
+        """Whether amount and radius are both better known than by their prior."""
+        known = _SIGMAS**2 if self.prior is None else np.diag(self.prior.covariance)
+        return bool(self) and bool(np.all(np.diag(self.covariance) < known))
+
+    @property
     def reach_px(self) -> int:
         """Reach of the inverse filter, which is a sum of Gaussians of increasing radius."""
         share = self.amount / (1 + self.amount)
@@ -144,12 +150,21 @@ class SharpeningScore:
     normal : (k + m, k + m) derivatives of the score with respect to the parameters.
     covariance : (k + m, k + m) of the score.
     on_place : (2, m) derivatives of the place (px) with respect to the parameters of the sharpening.
+    sharpening : with which the mark was fitted.
     """
 
     value: Array
     normal: Array
     covariance: Array
     on_place: Array
+    sharpening: Sharpening = Sharpening()
+
+    def relative_to(self, other: Sharpening) -> "SharpeningScore | None":
+        """Score at another sharpening, linearised; None if only one of both is a sharpening."""
+        if bool(self.sharpening) != bool(other):
+            return None
+        off = self.sharpening.values - other.values
+        return replace(self, value=self.value + self.normal[:, -len(off) :] @ off) if other else self
 
     def covariance_px2(self, sharpening: Sharpening) -> Array:
         """(2, 2) covariance of the place due to the uncertainty of the sharpening, or its whole effect if the mark was
@@ -166,15 +181,15 @@ def estimate_sharpening(before: Sharpening, scores: Sequence[SharpeningScore], d
 
     Parameters
     ----------
-    before : sharpening with which the marks were fitted.
-    scores : of the marks.
+    before : sharpening of the scan, from which the step is counted.
+    scores : of the marks, some of which may have been fitted with an earlier sharpening.
     departures : number of departures of the tone curve, the first parameters of each score.
 
     Returns
     -------
     Sharpening, or None if it is not significant.
     """
-    scores = [score for score in scores if score.normal.any()]
+    scores = [at for score in scores if score.normal.any() and (at := score.relative_to(before))]
     if len(scores) < FEWEST_MARKS:
         return None
     tone, count = list(range(departures)), len(scores[0].value) - departures

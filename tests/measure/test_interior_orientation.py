@@ -502,6 +502,27 @@ def test_without_marks_that_tell_the_sharpening_stays_as_it_is_known() -> None:
     assert fit_lines_and_sharpening(frame) is frame
 
 
+@pytest.mark.parametrize(("sigma", "times"), [(0.1, 0), (2.0, 1)])
+def test_a_sharpening_that_is_determined_is_not_estimated_again(
+    sigma: float, times: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known, estimated = Sharpening(0.8, 1.2, sigma**2 * np.eye(2)), list[Frame]()
+    scan = make_scan(np.zeros((400, 400))).replace_tone(Tone.unknown().sharpened(known))
+    placement = Placement("0", np.array([[1.0, 0.0, 200.0], [0.0, -1.0, 200.0]]), 1.0, 6, 1, 1, (1.0, 1.0))
+    layout, options = FiducialLayout(tuple(MARKS), (220.0, 220.0)), FiducialOptions()
+    frame, steps = Frame.from_placement(scan, layout, placement, options), "measure.fiducials.measure_frame"
+
+    def estimate(each: Frame) -> Frame:
+        estimated.append(each)
+        return each
+
+    monkeypatch.setattr(f"{steps}.detect_frame", lambda *_: frame)
+    monkeypatch.setattr(f"{steps}.fit_lines_and_sharpening", estimate)
+    monkeypatch.setattr(f"{steps}.refit_frame", lambda each: each)
+    assert measure_frame(scan, layout, placement, options) is frame
+    assert len(estimated) == times
+
+
 def test_a_square_is_alike_in_all_poses_and_six_marks_do_not() -> None:
     first = ("0", [0] * 4)
     assert all(same_picture(MARKS[:4], first, (pose, [0] * 4), NEAR_MM) for pose in POSES)

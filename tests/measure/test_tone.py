@@ -28,7 +28,7 @@ from measure.scans.opening import crop_scan, declared_tone
 from measure.tone.curve import LINEAR, Tone, ToneInformation, power, sampled_curve, srgb
 from measure.tone.declared import curve_of_profile
 from measure.tone.estimate import FrameTone, MarkTone, tone_score
-from measure.tone.sharpening import Sharpening
+from measure.tone.sharpening import Sharpening, SharpeningScore, estimate_sharpening
 from synthetic_images.tone_curve import coded
 
 FULL = 65535.0
@@ -459,6 +459,35 @@ def test_a_scan_that_is_not_sharpened_is_not_taken_for_one() -> None:
     assert not result.tone.tone.sharpening
     assert "sharpened" not in result.tone.note
     assert all(mark.covariance and Cause.SHARPENING not in mark.covariance.parts for mark in result.marks)
+
+
+def test_a_sharpening_is_the_same_from_scores_of_marks_fitted_with_different_ones() -> None:
+    """Of linear scores, each counted from the sharpening of its own fit."""
+    rng, truth = np.random.default_rng(3), Sharpening(1.2, 1.1)
+    fitted = [
+        Sharpening(amount, radius, np.eye(2)) for amount, radius in ((0.8, 1.0), (1.0, 1.3), (1.4, 0.9), (1.1, 1.1))
+    ]
+    scores = []
+    for each in fitted:
+        design = rng.normal(size=(3, 40))
+        normal = design @ design.T * 1e4
+        value = normal @ np.concatenate([[0.0], truth.values - each.values])
+        scores.append(SharpeningScore(value, normal, normal, np.zeros((2, 2)), each))
+    unsharpened = SharpeningScore(np.ones(5), np.eye(5), np.eye(5), np.zeros((2, 4)))
+    for before in fitted:
+        found = estimate_sharpening(before, [*scores, unsharpened], 1)
+        assert found is not None
+        np.testing.assert_allclose(found.values, truth.values, atol=1e-3)
+        assert found.is_determined
+
+
+def test_a_sharpening_is_determined_where_it_is_better_known_than_before() -> None:
+    assert not Sharpening().is_determined
+    assert Sharpening(0.8, 1.0, np.diag([0.5, 0.1])).is_determined
+    assert not Sharpening(0.8, 1.0, np.diag([0.01, 0.25])).is_determined  # the radius as before
+    pooled = Sharpening.pooled([Sharpening(0.8, 1.0, np.diag([0.01, 0.01]))] * 3)
+    assert not pooled.is_determined
+    assert replace(pooled, covariance=pooled.covariance / 2).is_determined
 
 
 def test_scans_of_a_scanner_say_together_how_it_sharpens() -> None:
