@@ -53,6 +53,11 @@ class ScanPart(PosixPath):
         return ScanPart, (str(self),)
 
     @property
+    def suffix(self) -> str:
+        """Ending of the file."""
+        return os.path.splitext(self._groups()[0])[1]
+
+    @property
     def page(self) -> int | None:
         """Number of the page, from 1; None: the first picture."""
         page = self._groups()[1]

@@ -12,7 +12,7 @@ from statistics import fmean
 import numpy as np
 
 from measure.errors import MeasurementError
-from measure.scans.remote import scan_path
+from measure.scans.remote import scan_path, whole_file
 from pipeline.archive import review_decisions
 from pipeline.archive.checked_results import CheckedResult
 from pipeline.archive.results_database import Kept, Store
@@ -129,7 +129,10 @@ class Work:
     def _complete(self, tasks: Sequence[ScanTask], scans: int, reporter: Reporter) -> None:
         """Measure the missing scans. scans: number of all scans; those measured earlier count as done."""
         kinds = {  # camera and file format, on which the time for a scan depends
-            task.name: (self._project.image_camera(task.name).path.stem, task.shown_scan.rpartition(".")[2].lower())
+            task.name: (
+                self._project.image_camera(task.name).path.stem,
+                whole_file(task.shown_scan).rpartition(".")[2].lower(),
+            )
             for task in tasks
         }
         left, failed = Counter(kinds.values()), defaultdict[str, list[str]](list)

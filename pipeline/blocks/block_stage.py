@@ -435,13 +435,15 @@ def write_pictures(
     tasks: Sequence[ResampleTask], cameras: Mapping[str, CameraFile], folder: Path
 ) -> tuple[BlockPicture, ...]:
     """Write frames as 8-bit images below folder/pictures, and their masks below folder/masks."""
-    made = []
+    made, images = [], dict[str, str]()
     for task in tasks:
         camera = cameras[task.camera]
         lattice = camera_lattice(camera, task.pitch_mm)
         picture, mask = _cut(task.target, lattice)
         mask = mask & _usable(camera, lattice)
         name = f"{file_word(task.camera)}/{task.image.replace('/', '_')}.png"
+        if images.setdefault(name, task.image) != task.image:
+            raise InputError(f"{images[name]!r} and {task.image!r} would share the picture {name}. Rename one scan.")
         for kind, content in (("pictures", _eight_bits(picture, mask)), ("masks", mask.astype(np.uint8) * 255)):
             path = path_below(folder / kind, name, "" if kind == "pictures" else ".png")
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,6 @@
 """Data for the export: the observed marks of every image and the results of the adjustment."""
 
+import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,6 +13,7 @@ from adjust.functional_model.lens import Lens
 from adjust.functional_model.projection import ImageModel, LineOfSight
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.scanner import NO_BEND
+from measure.scans.remote import ScanPart
 from pipeline.adjusting.picture_turn import NOT_TURNED, Turn, picture_turn, turned_back
 from pipeline.archive.made_from import current_adjustment
 from pipeline.errors import InputError
@@ -109,7 +111,12 @@ class OutFrame:
     @property
     def file_name(self) -> str:
         """File name of the scan; the image's name with .tif where there is none."""
-        return self.scan.name if self.scan else f"{self.image}.tif"
+        return self.scan_file.name if self.scan_file else f"{self.image}.tif"
+
+    @property
+    def scan_file(self) -> Path | None:
+        """File of the scan, which may be one page or a window of it."""
+        return Path(os.fspath(self.scan)) if isinstance(self.scan, ScanPart) else self.scan
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import numpy as np
 
 from adjust.functional_model.rotation import angles_from_rotation
 from measure.flags import Status
+from measure.scans.remote import ScanPart
 from pipeline.errors import InputError
 from pipeline.exchange.block import read_block
 from pipeline.exchange.formats import ExportOptions, Written, format_function
@@ -33,6 +34,7 @@ from pipeline.text.files import file_word, make_folder, path_below, write_atomic
 from pipeline.text.wording import listed
 
 README = "README.txt"
+SCAN_FORMATS = ("micmac", "mmvii", "metashape")  # whose pixels are those of the scan's file
 ROTATION_ERROR = 1e-3  # of R^T R: rotations are written with four decimals or more
 _HEAD = "Written by reseau"
 
@@ -46,13 +48,25 @@ def run_export(project: Project, format: str, folder: Path, options: ExportOptio
     write, convention = format_function("write", format)
     check_folder(folder)
     block = read_block(project)
-    images: dict[str, str] = {}  # by file name: other programs know images by nothing else
+    images, cameras = dict[str, str](), dict[str, str]()  # by file name: other programs know them by nothing else
     for frame in block.frames:
-        other = images.setdefault(frame.file_name, frame.image)
+        file_name = frame.scan.name if frame.scan and format not in SCAN_FORMATS else frame.file_name
+        if format in SCAN_FORMATS and isinstance(frame.scan, ScanPart) and (frame.scan.page or 1) > 1:
+            raise InputError(
+                f"image {frame.image!r} is page {frame.scan.page} of {frame.file_name}, and {format} reads the first "
+                "alone. Save the page as a file of its own, or export resampled frames: colmap or opencv."
+            )
+        name = Path(file_name).stem if format == "metashape" else file_name  # cameras of a chunk are labelled so
+        other = images.setdefault(name, frame.image)
         if other != frame.image:
             raise InputError(
-                f"images {other!r} and {frame.image!r} have files of the same name {frame.file_name!r}, and other "
+                f"images {other!r} and {frame.image!r} have files of the same name {name!r}, and other "
                 "programs know images by it. Export them as projects of their own."
+            )
+        camera = cameras.setdefault(file_word(frame.camera), frame.camera)
+        if camera != frame.camera and format in SCAN_FORMATS:
+            raise InputError(
+                f"cameras {camera!r} and {frame.camera!r} would have the same files {file_word(camera)!r}. Rename one."
             )
     written: Written = write(block, options)
     decisions = describe_decisions(read_decision_counts(project.comparator))

@@ -103,7 +103,7 @@ def _image(frame: OutFrame) -> dict[str, object]:
         for key, own in (("fiducials_px", frame.observed(True)), ("points_px", frame.observed(False)))
     }
     return {
-        "file": str(frame.scan.resolve()) if frame.scan else frame.file_name,
+        "file": str(frame.scan_file.resolve()) if frame.scan_file else frame.file_name,
         "label": Path(frame.file_name).stem,
         "camera": frame.camera,
         "pitch_mm": [pitch[0] / 1000.0, pitch[1] / 1000.0],

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from measure.flags import Status
+from measure.scans.remote import whole_file
 from pipeline.archive import made_from as provenance
 from pipeline.archive.checked_results import Judging, measured_scans, stored_judging, written_judging
 from pipeline.archive.review_decisions import inapplicable
@@ -129,7 +130,7 @@ def reduced(
 
 
 def _ending(scan: str) -> str:
-    return scan.rpartition(".")[2].lower()
+    return whole_file(scan).rpartition(".")[2].lower()
 
 
 def _one_by_one(data: ReportData, scans: Iterable[MeasuredScan]) -> Iterator[ReportData]:

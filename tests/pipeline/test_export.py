@@ -49,11 +49,12 @@ from adjust import LineOfSight
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens, Prior
 from adjust.functional_model.transformation import Film
+from measure.scans.remote import scan_path
 from pipeline import InputError, read_project
 from pipeline.cli import DONE, LOOK, WRONG_INPUT, run
-from pipeline.exchange import micmac_format, pinhole
-from pipeline.exchange.block import read_block
-from pipeline.exchange.formats import FORMATS, IMPORTED
+from pipeline.exchange import exchange_stage, micmac_format, pinhole
+from pipeline.exchange.block import OutFrame, read_block
+from pipeline.exchange.formats import FORMATS, IMPORTED, ExportOptions
 from pipeline.exchange.geojson_format import lon_lat
 from pipeline.exchange.pinhole import frame_corners_mm
 from pipeline.exchange.tables import _check_words
@@ -395,6 +396,37 @@ def test_a_digital_camera_goes_out_as_its_pictures_are(tmp_path: Path, monkeypat
     assert not (folder / "Ori-InterneScan").exists()
     off = np.linalg.norm(micmac_px(folder, "f3", POINTS, "") - pixels[3], axis=1)
     assert off.max() < 1.05 * stated_misfit_px(folder) + SAME_PX
+
+
+def out_frame(image: str, scan: str, camera: str = "K") -> OutFrame:
+    return OutFrame(image, camera, scan_path(scan), (20.0, 20.0), (), None, is_oriented=False)
+
+
+def test_a_window_goes_out_as_its_file() -> None:
+    frame = out_frame("a", "scans/roll.tif#window=5,0,9,9")
+    assert (frame.file_name, frame.scan_file, present(frame.scan).suffix) == (
+        "roll.tif",
+        Path("scans/roll.tif"),
+        ".tif",
+    )
+
+
+@pytest.mark.parametrize(
+    ("format", "frames", "words"),
+    [
+        ("micmac", [("a", "r.tif#window=0,0,9,9"), ("b", "r.tif#window=9,0,9,9")], "files of the same name 'r.tif'"),
+        ("mmvii", [("a", "r.tif#page=2")], "is page 2 of r.tif, and mmvii reads the first alone"),
+        ("metashape", [("x/a", "x/a.tif"), ("y/a", "y/a.jpg")], "files of the same name 'a'"),
+        ("micmac", [("a", "a.tif", "C 1"), ("b", "b.tif", "C-1")], "cameras 'C 1' and 'C-1' would have the same files"),
+    ],
+)
+def test_what_would_share_a_file_is_refused(
+    format: str, frames: list[tuple[str, ...]], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    block = Mock(frames=[out_frame(*each) for each in frames])
+    monkeypatch.setattr(exchange_stage, "read_block", lambda _: block)
+    with pytest.raises(InputError, match=re.escape(words)):
+        exchange_stage.run_export(Mock(), format, tmp_path / "out", ExportOptions())
 
 
 def test_a_turned_picture_goes_out_turned_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

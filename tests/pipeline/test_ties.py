@@ -335,6 +335,10 @@ def test_pictures_lie_where_the_lattice_says(tmp_path: Path) -> None:
     scans = (FrameScan("f2", tmp_path / "f2.tif", chain(2)),)
     task = ResampleTask("f2", "K", "0m", projects.PITCH_MM, FAST, None, tmp_path / "frame.tif", scans)
     assert resampled(task).problem == ""
+    with pytest.raises(InputError, match="'a/b' and 'a_b' would share"):
+        block_stage.write_pictures(
+            [replace(task, image=name) for name in ("a/b", "a_b")], {"K": BLOCK_CAMERA}, tmp_path
+        )
     (picture,) = block_stage.write_pictures([task], {"K": BLOCK_CAMERA}, tmp_path)
     image = np.asarray(cv2.imread(str(tmp_path / "pictures" / picture.name), cv2.IMREAD_UNCHANGED), dtype=float)
     mask = np.asarray(cv2.imread(str(tmp_path / "masks" / f"{picture.name}.png"), cv2.IMREAD_UNCHANGED))
