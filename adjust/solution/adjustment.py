@@ -327,8 +327,8 @@ class _Solver:
         return replace(result, remarks=(*result.remarks, elsewhere)) if elsewhere else result
 
     def _refuse_blunder(self, network: Network, given: Adjustment | None) -> None:
-        if slip := blunder_sentence(network, given, self.trials):
-            raise AdjustmentError(slip)
+        if sentence := blunder_sentence(network, given, self.trials):
+            raise AdjustmentError(sentence)
 
     def check_points(self, network: Network, start: Approximations) -> Adjustment:
         """Adjust a network and report given points with coordinate blunders."""
@@ -352,7 +352,7 @@ class _Solver:
         if result.termination == "singular" or (result.converged and self.trials.agrees(result)):
             return result
         if blunders := self.coordinate_blunders(network, start):
-            return replace(result, slips={each.name: each.sentence for each in blunders})
+            return replace(result, coordinate_blunders={each.name: each.sentence for each in blunders})
         given = sorted(name for name in network.known_places if name in network.observed_points)
         if result.converged or len(given) != ENOUGH - 1:
             return result

@@ -382,11 +382,13 @@ def blunder_sentence(network: Network, given: Adjustment | None, trials: Trials)
     return ""
 
 
-def _sentence(slips: Sequence[NetworkHypothesis], found: Adjustment, given: Adjustment | None, family: float) -> str:
-    words = [each.words for each in slips]
+def _sentence(
+    hypotheses: Sequence[NetworkHypothesis], found: Adjustment, given: Adjustment | None, family: float
+) -> str:
+    words = [each.words for each in hypotheses]
     if len(words) >= len(AXES):  # the mirrored axis cannot be identified
         words = [MIRRORED, *words[len(AXES) :]]
-    what = "; or ".join(words) + slips[0].figures(found)
+    what = "; or ".join(words) + hypotheses[0].figures(found)
     if given is None:
         stands = "nothing can be adjusted"
     elif not given.converged:
@@ -395,7 +397,7 @@ def _sentence(slips: Sequence[NetworkHypothesis], found: Adjustment, given: Adju
         stands = f"σ₀ is {given.sigma0:.3g} (p < {family:g})"
     return (
         f"{what[0].upper()}{what[1:]}. Without this all {len(found.network.observations)} observations agree "
-        f"(σ₀ = {found.sigma0:.2f}); as it stands, {stands}. {slips[0].remedy}"
+        f"(σ₀ = {found.sigma0:.2f}); as it stands, {stands}. {hypotheses[0].remedy}"
     )
 
 
@@ -518,7 +520,7 @@ def check_plausibility(result: Adjustment, trials: Trials) -> Adjustment:
     # The film transformations of an iteration that did not converge take marks anywhere.
     outside = sorted(row for view in views if result.converged or view.digital for row in view.outside)
     remarks, misread = list(_marks_outside(result, outside, trials)), tuple(_both_sides(result, trials))
-    if result.converged and not outside and not result.slips:
+    if result.converged and not outside and not result.coordinate_blunders:
         remarks += [each for view in views for each in _principal_point(view, result, trials.family)]
     return replace(result, misread=misread, remarks=(*result.remarks, *remarks))
 

@@ -66,8 +66,8 @@ class Adjustment(estimates.Estimates, PlottedResult):
     weights : (n,) factors of robust estimation on the weights of the observations; 1 without it.
     variance_factors : estimated variance factors by group.
     remarks : remarks on how the result was obtained; listed first among the warnings.
-    slips : by given point, a sentence on the coordinate blunder that prevents agreement or a solution; other suspects
-        are then consequences of these.
+    coordinate_blunders : by given point, a sentence on the blunder that prevents agreement or a solution; other
+        suspects are then consequences of these.
     left_out : reasons by name of the images without an orientation; `network` has the others.
     unmet : sentences by name of the points whose rays do not meet; `network` has the others.
     misread : sentences on mirrored images; other contradictions are then consequences of these.
@@ -88,7 +88,7 @@ class Adjustment(estimates.Estimates, PlottedResult):
     weights: Array = field(default_factory=lambda: np.empty(0))
     variance_factors: Mapping[str, float] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
-    slips: Mapping[str, str] = field(default_factory=dict)
+    coordinate_blunders: Mapping[str, str] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     unmet: Mapping[str, str] = field(default_factory=dict)
     misread: tuple[str, ...] = ()
@@ -246,8 +246,8 @@ class Adjustment(estimates.Estimates, PlottedResult):
             variance = variance_factor(run, _redundancy(run, self.cofactor))
             tested = reliability(run, variance, self.probabilities)
         found = Snooping(run, self.probabilities).suspects(tested, round(variance.redundancy)) if tested else ()
-        is_warned = not self.slips or self.run.removed
-        return tuple(each for each in found if is_warned or each.tested.point in self.slips)
+        is_warned = not self.coordinate_blunders or self.run.removed
+        return tuple(each for each in found if is_warned or each.tested.point in self.coordinate_blunders)
 
     @cached_property
     def explanations(self) -> tuple[Explanation, ...]:
@@ -261,9 +261,21 @@ class Adjustment(estimates.Estimates, PlottedResult):
         Where coordinate blunders prevent a solution, the warnings on the run are dropped as consequences of these.
         """
         left_out = (f"Left out of the adjustment: {reason}" for reason in dict.fromkeys(self.left_out.values()))
-        own = () if self.slips and not self.converged else run_warnings(self.scaled, self.cofactor, self.residuals)
+        own = (
+            ()
+            if self.coordinate_blunders and not self.converged
+            else run_warnings(self.scaled, self.cofactor, self.residuals)
+        )
         curved = curved_valley_warnings(self.run, self.cofactor) if self.converged else ()
-        return (*self.misread, *self.slips.values(), *left_out, *self.unmet.values(), *self.remarks, *own, *curved)
+        return (
+            *self.misread,
+            *self.coordinate_blunders.values(),
+            *left_out,
+            *self.unmet.values(),
+            *self.remarks,
+            *own,
+            *curved,
+        )
 
     @cached_property
     def notes(self) -> tuple[str, ...]:

@@ -443,7 +443,7 @@ def inaccurate_points(given: Network, sigma: float) -> Network:
 
 @dataclass(frozen=True)
 class Blunder:
-    """A slip: how the network is otherwise given, how it is spoilt, and what has to be said of it."""
+    """A blunder: how the network is otherwise given, how it is spoilt, and what has to be said of it."""
 
     oriented: Array | None
     spoil: Callable[[Network], Network]
@@ -521,7 +521,7 @@ SINGLE = ("is suspect", "is not where", "swapped")
 def blunder_outcome(kind: Blunder, sentences: list[str]) -> str:
     """named: what is to be said, and nothing that blames anything else; misleading: something else is blamed.
 
-    Beside a point that is named, tests of single observations may tell of its neighbours; no other slip's blame may
+    Beside a point that is named, tests of single observations may tell of its neighbours; no other blunder's blame may
     stand there.
     """
     is_single = any(words in named for words in SINGLE for named in kind.words)

@@ -474,7 +474,7 @@ def place(sentence: str) -> Array:
 
 @pytest.fixture
 def one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No slip of the whole network is sought, which takes longer than all the rest."""
+    """No blunder of the whole network is sought, which takes longer than all the rest."""
     monkeypatch.setattr("adjust.solution.adjustment.blunder_sentence", lambda *_: "")
 
 
@@ -550,7 +550,7 @@ def test_what_is_wrong_with_all_points_is_no_slip_of_one() -> None:
     shifted = adjust_network(
         set_given(network, {row: each + np.array([500, -300, 20]) for row, each in enumerate(xyz)})
     )
-    assert shifted.slips == {}
+    assert shifted.coordinate_blunders == {}
     assert shifted.converged
 
 
@@ -561,7 +561,7 @@ def test_four_points_do_not_tell_which_is_wrong() -> None:
     few = nets.free_points(network, [point.id for point in network.points[4:]])
     result = adjust_network(set_given(few, {1: xyz[1][[1, 0, 2]]}), iteration_limit=STOPPED)
     assert not result.converged
-    assert result.slips == {}
+    assert result.coordinate_blunders == {}
     assert "The points 0, 1, 2, 3 alone are given" in result.warnings[0]
     with pytest.raises(AdjustmentError, match="four points do not tell which of them is wrong"):
         adjust_network(set_given(few, {1: xyz[1] + [300.0, 0.0, 0.0]}))

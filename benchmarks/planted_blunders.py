@@ -13,15 +13,15 @@ from faults import BLUNDERS, blunder_network, blunder_outcome, blunder_sentences
 
 from benchmarks.harness import Row
 
-COLUMNS = {"slip": "", "named": "d", "unnamed": "d", "misleading": "d", "cpu_s": ".1f"}
+COLUMNS = {"blunder": "", "named": "d", "unnamed": "d", "misleading": "d", "cpu_s": ".1f"}
 
 
 def cells() -> Iterator[Row]:
-    yield from ({"slip": name} for name in BLUNDERS)
+    yield from ({"blunder": name} for name in BLUNDERS)
 
 
-def case(slip: str, networks: int = 20) -> Row:
-    kind, begun, count = BLUNDERS[slip], time.process_time(), Counter[str]()
+def case(blunder: str, networks: int = 20) -> Row:
+    kind, begun, count = BLUNDERS[blunder], time.process_time(), Counter[str]()
     for number in range(networks):
         spoilt = kind.spoil(blunder_network(number, kind.oriented))
         count[blunder_outcome(kind, blunder_sentences(spoilt))] += 1
