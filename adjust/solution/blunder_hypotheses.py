@@ -392,7 +392,7 @@ def _sentence(
     if given is None:
         stands = "nothing can be adjusted"
     elif not given.converged:
-        stands = "the iteration does not come to rest"
+        stands = "the iteration does not converge"
     else:
         stands = f"σ₀ is {given.sigma0:.3g} (p < {family:g})"
     return (

@@ -466,10 +466,10 @@ def _agreement(rows: Sequence[ComparedParameter], sigmas_tell: bool) -> tuple[Ve
     loosest = max(rows, key=_sigma_ratio)
     found = f"{worst.name} differs most from OpenCV's, by {worst.difference_sigmas:.2f} sigma"
     if worst.difference_sigmas > LARGEST_DIFFERENCE:
-        return "differs", f"{found}; up to {LARGEST_DIFFERENCE:g} would be in order."
+        return "differs", f"{found}; up to {LARGEST_DIFFERENCE:g} is acceptable."
     if sigmas_tell and _sigma_ratio(loosest) > LARGEST_SIGMA_RATIO:
         ratio = f"The standard deviations of {loosest.name} differ by a factor of {_sigma_ratio(loosest):.2f}"
-        return "differs", f"{ratio}, up to {LARGEST_SIGMA_RATIO:g} would be in order; {found}."
+        return "differs", f"{ratio}, up to {LARGEST_SIGMA_RATIO:g} is acceptable; {found}."
     return "agrees", f"All {len(rows)} parameters agree: {found}."
 
 

@@ -137,7 +137,7 @@ def _no_solution(adjustment: AdjustmentRecord) -> Iterator[ReportedProblem]:
     if not adjustment.converged and not adjustment.singular:
         is_practically = any(warning.startswith("Practically singular") for warning in adjustment.warnings)
         yield ReportedProblem(
-            f"The iteration did not come to rest ({adjustment.termination}, {adjustment.iterations} iterations).",
+            f"The iteration did not converge ({adjustment.termination}, {adjustment.iterations} iterations).",
             "The images hardly determine what is named below as practically singular: add what is advised there, or "
             "fix it."
             if is_practically
@@ -391,7 +391,7 @@ def _sentence(data: ReportData, shots: list[ReportedFrame], level: Level, proble
     if not data.adjustment:
         return f"Measured: {found}{ending}"
     if level == "failed":
-        why = "the network is singular" if data.adjustment.singular else "the iteration did not come to rest"
+        why = "the network is singular" if data.adjustment.singular else "the iteration did not converge"
         return f"There is no calibration: {why}."
     constants = []
     for name, camera in data.adjustment.cameras.items():

@@ -457,7 +457,7 @@ def test_tilted_frames_are_oriented_and_calibrate_the_camera(seed: int) -> None:
 
 @parametrize_with_studies("sigma", [2.0, np.inf], quick=(1,))
 def test_a_principal_distance_that_is_a_guess_is_found_from_the_images(sigma: float) -> None:
-    """Twice the true one, and known no better than that: it is sought where the iteration does not come to rest."""
+    """Twice the true one, and known no better than that: it is sought where the iteration does not converge."""
     rng = np.random.default_rng(1)
     network, _ = nets.simulated(rng, points=nets.field_points(rng, 40))
     camera = network.cameras[0]

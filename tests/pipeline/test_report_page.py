@@ -517,7 +517,7 @@ def test_without_a_solution_there_is_no_result(adjusted_data: ReportData) -> Non
     )
     verdict = judge(stopped)
     assert verdict.level == "failed"
-    assert "There is no calibration: the iteration did not come to rest." in verdict.sentence
+    assert "There is no calibration: the iteration did not converge." in verdict.sentence
     assert "iteration limit, 50 iterations" in verdict.problems[0].what
     assert verdict.problems[1].what == "Not final."
 
