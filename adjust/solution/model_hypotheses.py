@@ -280,8 +280,8 @@ def _own_affinities(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     sigma = unknowns.sigma.copy()
     sigma[unknowns.camera[camera.name][[name in known for name in (*INTERIOR_NAMES, *of.parameters)]]] = 0.0
     held = replace(run, problem=replace(problem, unknowns=replace(unknowns, sigma=sigma)))
-    fields_mm = fields_mm.reshape(len(fields_mm), -1, 2)
-    yield _displaced_images(held, "affinities", "affinities", camera, words, fields_mm)
+    by_affinity_mm = fields_mm.reshape(len(fields_mm), -1, 2)
+    yield _displaced_images(held, "affinities", "affinities", camera, words, by_affinity_mm)
 
 
 def _drift(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:

@@ -127,8 +127,8 @@ def test_marks_of_a_scan_blurred_by_motion_may_lie_anywhere_in_the_blur() -> Non
 def test_standard_deviations_of_an_enlarged_scan_are_doubled() -> None:
     matrix, random = pixel_from_camera("0"), np.random.default_rng(7)
     picture = frame_picture(ALIKE, matrix)
-    picture = cv2.resize(picture + random.normal(0.0, 3.0, picture.shape), None, fx=1.1, fy=1.1)
-    result = measure_fiducials(make_scan(np.rint(picture)), ALIKE, (PITCH_UM / 1.1, PITCH_UM / 1.1))
+    enlarged = cv2.resize(picture + random.normal(0.0, 3.0, picture.shape), None, fx=1.1, fy=1.1)
+    result = measure_fiducials(make_scan(np.rint(enlarged)), ALIKE, (PITCH_UM / 1.1, PITCH_UM / 1.1))
     assert [Code.IMPRECISE in problem.codes for problem in result.problems] == [True]
     for mark in result.marks:
         assert mark.covariance is not None
