@@ -1,6 +1,8 @@
 """`reseau adjust` and `reseau choose`: adjust comparator coordinates, with scanner terms and the eccentricity of disks;
 select film deformation and distortion model."""
 
+import os
+import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -35,6 +37,7 @@ from pipeline.terminal import uncut_table
 from pipeline.text.wording import listed
 from pipeline.types import Array
 
+_ENDING = re.compile(r"\.[a-z][a-z0-9]{1,3}")  # of an image file; the known ones are no part of names
 _ROUNDS = 4  # largest number of corrections: each is off by its own relative error, so the second is below the noise
 _SETTLED_SIGMAS = 0.01  # change of the correction that ends the iteration, standard deviations of an observation
 _NOTICEABLE_SIGMAS = 0.2  # standard deviations: a larger possible eccentricity that is not corrected is reported
@@ -105,7 +108,8 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     adjustment, uncorrected = first, tuple[str, ...]()
     if project.disk_radius > 0.0:
         adjustment, uncorrected = _correct_eccentricity(project, first, options)
-    remarks = (*adjustment.remarks, *left_out, *untold, *misnamed, *uncorrected)
+    alike = _alike_names(project, marks)
+    remarks = (*adjustment.remarks, *left_out, *untold, *misnamed, *alike, *uncorrected)
     return replace(adjustment, unmodelled_mm=first.unmodelled_mm, remarks=remarks, unused=notes)
 
 
@@ -198,6 +202,29 @@ def _misnamed(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, 
     return (
         f"The file of images says nothing of {without_line}, and names {without_marks}, of which there are no marks. "
         "Look for a misspelt name.",
+    )
+
+
+def _alike_names(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, ...]:
+    """Warning of images of one camera that are probably one: their names differ by case and ending only. Images that
+    images.csv or the scans list both are two."""
+    given, first, pairs = project.given_images, dict[str, str](), list[str]()
+    listed_names = (given.exterior if given else {}, project.scans)
+    names = sorted({mark.image for mark in marks})
+    stems = {name.casefold() for name in names}
+    for name in names:
+        stem, ending = os.path.splitext(name.casefold())
+        key = stem if _ENDING.fullmatch(ending) and stem in stems else name.casefold()
+        other = first.setdefault(key, name)
+        if other == name or project.image_camera(other) != project.image_camera(name):
+            continue
+        if not any(name in known and other in known for known in listed_names):
+            pairs.append(f"{other} and {name}")
+    if not pairs:
+        return ()
+    return (
+        f"{listed(pairs)} differ only by case and ending, and count as two images: give one image one name in "
+        "comparator.csv. If they are two, list both in images.csv.",
     )
 
 

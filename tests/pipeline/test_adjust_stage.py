@@ -31,6 +31,7 @@ from pipeline.report import ReportData
 from pipeline.report.verdict import judge
 from pipeline.results.adjustment_file import read_own_covariance
 from pipeline.results.adjustment_record import AdjustmentRecord
+from pipeline.text.files import image_name
 
 NAMES = sorted(path.stem for path in CASES.glob("*.json") if not path.stem.startswith("v_"))
 
@@ -670,3 +671,25 @@ def test_points_that_no_image_shows_are_a_note_and_an_unknown_one_in_one_image_i
     (warning,) = [warning for warning in result["warnings"] if "single" in warning]
     assert "measured in one image only, and so left out: single (f2). Two images are needed" in warning
     assert not any("single" in note for note in result["notes"])
+
+
+@pytest.mark.parametrize("other", ["F1.TIF", "f1.dng"])
+def test_names_of_one_image_that_differ_by_case_and_ending_need_a_look(
+    other: str, tmp_path: Path, printed_line: projects.Printed
+) -> None:
+    project = projects.adjusted_project(tmp_path)
+    projects.replace_text(project, 'scans = ["scans/*.tif"]\n', "")
+    table = tmp_path / "comparator.csv"
+    head, *rows = table.read_text().splitlines()
+    own = [row.replace("f1,", f"{other},") for row in rows if row.startswith("f1,")]
+    fiducials = [row for row in own if ",fiducial," in row]
+    halved = [row for row in rows if not row.startswith("f1,") or ",fiducial," in row or int(row.split(",")[1]) % 2]
+    targets = [row for row in own if ",target," in row and int(row.split(",")[1]) % 2 == 0]
+    table.write_text("\n".join([head, *halved, *fiducials, *targets, ""]))
+    names = sorted(["f1", image_name(other)])
+    words = f"{names[0]} and {names[1]} differ only by case and ending, and count as two images"
+    assert words in printed_line("adjust", project, code=LOOK)
+    listed = "image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg\n" + "".join(f"{name},,,,,,\n" for name in names)
+    (tmp_path / "images.csv").write_text(listed)
+    projects.replace_text(project, "[object]\n", '[object]\nimages = "images.csv"\n')
+    assert words not in printed_line("adjust", project)
