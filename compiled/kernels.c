@@ -11,6 +11,15 @@
 
 #define MOST_TAPS 6
 
+/* None, or NULL with a ValueError that says why not. */
+static PyObject *none_if(int fits, const char *why)
+{
+    if (fits)
+        Py_RETURN_NONE;
+    PyErr_SetString(PyExc_ValueError, why);
+    return NULL;
+}
+
 /* Weights of the taps of a B-spline of degree 3 or 5, at the fraction t after the tap degree / 2. */
 static void spline_weights(int degree, double t, double *weight)
 {
@@ -110,11 +119,8 @@ static PyObject *spline_samples(PyObject *module, PyObject *args)
     PyBuffer_Release(&rows);
     PyBuffer_Release(&columns);
     PyBuffer_Release(&samples);
-    if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "the sizes of coefficients, places and samples do not go together");
-        return NULL;
-    }
-    return PyLong_FromSsize_t(clamped);
+    const char *fault = "the sizes of coefficients, places and samples do not go together";
+    return fits ? PyLong_FromSsize_t(clamped) : none_if(0, fault);
 }
 
 /* Elimination of small blocks of unknowns. */
@@ -290,11 +296,7 @@ static PyObject *square_rows(PyObject *module, PyObject *args)
     free(row);
     free(sums);
     close_tables(t, TABLES);
-    if (!ready) {
-        PyErr_SetString(PyExc_ValueError, "the sizes of rows and cells do not go together");
-        return NULL;
-    }
-    Py_RETURN_NONE;
+    return none_if(ready, "the sizes of rows and cells do not go together");
 }
 
 /* The border (o, s) of a block, its shared unknowns sorted by their places in the front, and the first indices of the
@@ -538,11 +540,7 @@ static PyObject *eliminate_blocks(PyObject *module, PyObject *args)
     free(e.rank);
     give_back(&e.borders);
     close_tables(e.t, TABLES);
-    if (fault) {
-        PyErr_SetString(PyExc_ValueError, fault);
-        return NULL;
-    }
-    Py_RETURN_NONE;
+    return none_if(!fault, fault);
 }
 
 /* border_cofactors(first, sequence, home, group, members, singles, parts, alone, fronts, after, squares, cofactors)
@@ -596,11 +594,7 @@ static PyObject *border_cofactors(PyObject *module, PyObject *args)
     }
     give_back(&b);
     close_tables(t, TABLES);
-    if (!ready) {
-        PyErr_SetString(PyExc_ValueError, "the sizes of borders and fronts do not go together");
-        return NULL;
-    }
-    Py_RETURN_NONE;
+    return none_if(ready, "the sizes of borders and fronts do not go together");
 }
 
 /* target_rays(values, exterior, place, image, rotation, ray, in_camera) -> None
@@ -634,11 +628,7 @@ static PyObject *target_rays(PyObject *module, PyObject *args)
             *place_of(&t[RAY], i, k) = -p[k] / depth;
     }
     close_tables(t, TABLES);
-    if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "the sizes of targets do not go together");
-        return NULL;
-    }
-    Py_RETURN_NONE;
+    return none_if(fits, "the sizes of targets do not go together");
 }
 
 /* target_derivatives(rows, image, rotation, attitude, ray, in_camera, by_ray, exterior, place, camera, first, derivatives)
@@ -687,11 +677,7 @@ static PyObject *target_derivatives(PyObject *module, PyObject *args)
         }
     }
     close_tables(t, TABLES);
-    if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "the sizes of targets and derivatives do not go together");
-        return NULL;
-    }
-    Py_RETURN_NONE;
+    return none_if(fits, "the sizes of targets and derivatives do not go together");
 }
 
 /* whiten_rows(by_observation, covariance, differences, root, rows, right) -> None
@@ -731,11 +717,7 @@ static PyObject *whiten_rows(PyObject *module, PyObject *args)
         }
     }
     close_tables(t, TABLES);
-    if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "the sizes of rows do not go together");
-        return NULL;
-    }
-    Py_RETURN_NONE;
+    return none_if(fits, "the sizes of rows do not go together");
 }
 
 /* Cells of the bounding box of one part of a drawing: the sum of each row up to a cell is the area covered in it. */
@@ -822,11 +804,7 @@ static PyObject *cover_cells(PyObject *module, PyObject *args)
     PyBuffer_Release(&end);
     PyBuffer_Release(&first);
     PyBuffer_Release(&covered);
-    if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "the sizes of lines, parts and cells do not go together");
-        return NULL;
-    }
-    Py_RETURN_NONE;
+    return none_if(fits, "the sizes of lines, parts and cells do not go together");
 }
 
 /* Quotient rounded down. */
@@ -898,11 +876,7 @@ static PyObject *blurred_images(PyObject *module, PyObject *args)
     PyBuffer_Release(&sharp);
     PyBuffer_Release(&taps);
     PyBuffer_Release(&images);
-    if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "the sizes of cells, taps and images do not go together");
-        return NULL;
-    }
-    Py_RETURN_NONE;
+    return none_if(fits, "the sizes of cells, taps and images do not go together");
 }
 
 static PyMethodDef methods[] = {
@@ -918,8 +892,7 @@ static PyMethodDef methods[] = {
     {NULL, NULL, 0, NULL},
 };
 
-static struct PyModuleDef definition = {PyModuleDef_HEAD_INIT, "kernels", "Compiled inner loops.", -1, methods,
-                                        NULL, NULL, NULL, NULL};
+static struct PyModuleDef definition = {PyModuleDef_HEAD_INIT, "kernels", "Compiled inner loops.", -1, methods};
 
 PyMODINIT_FUNC PyInit_kernels(void)
 {
