@@ -117,8 +117,9 @@ class LocalPool(futures.ThreadPoolExecutor):
         self._ended = True
         super().shutdown(wait=False, cancel_futures=True)
         while any(thread.is_alive() for thread in self._threads):  # a thread may be starting its process
-            for process in multiprocessing.active_children():
-                process.terminate()
+            for executor in tuple(self._all):  # not all children: the calling program may have its own
+                for process in tuple((executor._processes or {}).values()):
+                    process.terminate()
             time.sleep(CHECKED_AGAIN_S)
 
     def _call(self, call: Callable[[], Any]) -> Any:

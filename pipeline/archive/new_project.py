@@ -2,6 +2,7 @@
 
 import glob
 import os
+import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -206,10 +207,17 @@ def init_project(given: Sequence[Path], folder: Path, reporter: Reporter, max_pi
         lines = [f"{_place(group)}, {group.digital}: {group.calibrate_command}" for group in new.digital]
         where = listed(list(map(str, given)))
         raise InputError("\n".join([f"{where}: no scan of film. SIZE: of a square, as 25mm.", *lines]))
-    write_atomically(folder / "project.toml", project_text(new))
-    named = zip(names_below(new.cameras), new.cameras.values(), strict=True)
-    rows = sorted((name, f"{PREFIX}{camera}" if camera else "") for name, camera in named)
+    text, names = project_text(new), names_below(new.cameras)
+    for name, path in zip(names, new.cameras, strict=True):
+        if not name.isprintable() or any(unicodedata.category(letter) == "Cs" for letter in str(path)):
+            raise InputError(
+                f"the file name {str(path)!a} is not text in UTF-8 on one line, so nothing was written. Rename it."
+            )
+    rows = sorted(
+        (name, f"{PREFIX}{camera}" if camera else "") for name, camera in zip(names, new.cameras.values(), strict=True)
+    )
     images = [csv_line(("image", "camera")), *map(csv_line, rows)]
+    write_atomically(folder / "project.toml", text)
     write_atomically(folder / "images.csv", "\n".join(images) + "\n")
     return new
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -304,6 +305,18 @@ def test_a_folder_is_measured(drawn_library: Path, capsys: Capture, monkeypatch:
     again = capsys.readouterr()
     assert set(json.loads(again.out)["frames"]) == {"a"}
     assert "1 of 1 scan measured (1 stored already)" in again.err
+
+
+@pytest.mark.usefixtures("fake_identification")
+def test_a_file_name_that_is_no_utf_8_is_refused_before_a_file_is_written(tmp_path: Path, refusal: Refusal) -> None:
+    scan(tmp_path / "box" / "1952" / "a.tif")
+    os.rename(tmp_path / "box" / "1952" / "a.tif", os.fsencode(tmp_path / "box" / "1952") + b"/b\xfc.tif")
+    scan(tmp_path / "box" / "1952" / "a.tif")
+    for _ in range(2):
+        words = refusal("init", tmp_path / "box", "--out", tmp_path / "work")
+        assert "is not text in UTF-8" in words
+        assert "xfc.tif" in words or "udcfc.tif" in words
+    assert not (tmp_path / "work").exists()
 
 
 def test_photographs_alone_are_refused(tmp_path: Path, refusal: Refusal) -> None:

@@ -150,11 +150,16 @@ def test_a_process_that_is_begun_while_the_pool_ends_is_ended_too(monkeypatch: p
             raise KeyboardInterrupt
 
     monkeypatch.setattr(LocalPool, "_start", late)
+    # A process of the calling program goes on.
+    own = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60.0,), daemon=True)
+    own.start()
     start = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert time.monotonic() - start < 15.0
-    assert not multiprocessing.active_children()
+    assert multiprocessing.active_children() == [own]
+    own.kill()
+    own.join()
 
 
 def cluster_process(number: int, seconds: float = 0.0) -> tuple[int, int]:
