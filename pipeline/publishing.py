@@ -11,20 +11,17 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
-from pipeline.errors import InputError, WriteError
+from pipeline.errors import WriteError
 from pipeline.files.project_file import Project
-from pipeline.text.files import writing
+from pipeline.text.files import FORMS, check_replaceable, writing
 
-_HEAD = 4096
-_JSON = rb'\s*\{\s*("reseau"|"verdict": "[a-z ]+",\s*"reason"|"chosen": (null|\{\s*"transformation"))'
 _HEADS = {
-    ".json": _JSON,
+    **FORMS,
     ".db": rb"SQLite format 3\0",
     ".npz": rb"PK\x03\x04.{26}(fingerprint|names)\.npy",
     ".csv": rb"# written about the frames, reseau",
     ".html": rb"<!DOCTYPE html>.*<title>.*: (calibration|film|frame) report</title>",
     ".toml": rb"# Marks learned by reseau",
-    ".tif": rb"(II|MM).*reseau",
 }
 _COMPARATOR = rb'(\xef\xbb\xbf)?"?# comparator coordinates, reseau'
 
@@ -132,19 +129,9 @@ def _undisturbed() -> Iterator[None]:
 
 
 def _check_replaceable(path: Path, comparator: Path) -> None:
-    """Raise InputError for a path where something exists that is not a result of this kind: a device, a user's file."""
-    if path.is_dir() or (path.exists() and not path.is_file()):
-        raise InputError(f"{path}: a result is to be written there, but it is no regular file. Name another place.")
-    if not path.exists():
-        return
-    with path.open("rb") as file:
-        head = file.read(_HEAD)
+    """Raise InputError for a path where something exists that is not a result of this kind."""
     form = _COMPARATOR if path == comparator else _HEADS.get(path.suffix, rb"(?!)")
-    if head and not re.match(form, head, re.DOTALL):
-        raise InputError(
-            f"{path}: a result is to be written there, but the file that stands there was not written by reseau. Move "
-            f"it away, or name another {'comparator' if path == comparator else 'output'} in the project."
-        )
+    check_replaceable(path, form, f"name another {'comparator' if path == comparator else 'output'} in the project")
 
 
 def outside_note(project: Project) -> str:

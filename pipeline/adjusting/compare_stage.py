@@ -23,7 +23,7 @@ from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.record_json import write_record
 from pipeline.results.stage_files import DRIFT, ComparisonRecord, ParameterDifference, comparison_record
 from pipeline.terminal import uncut_table
-from pipeline.text.files import check_writable
+from pipeline.text.files import FORMS, check_replaceable, check_writable
 from pipeline.text.wording import did_you_mean, listed
 from pipeline.types import Array
 
@@ -52,6 +52,9 @@ def run_compare(
     InputError, AdjustmentError
         A file has no calibration of the camera, or the calibrations are not comparable.
     """
+    files = {} if out is None else {each: out / f"compare{each}" for each in (".json", ".svg")}
+    for ending, path in files.items():
+        check_replaceable(path, FORMS[ending], "name another --out")
     labels = _labels(paths)
     contents = {path: read_adjustment(path) for path in paths}
     lenses = {path: calibrated_lens(path, content, camera) for path, content in contents.items()}
@@ -75,8 +78,8 @@ def run_compare(
     record = comparison_record(comparison, remarks, level)
     if out is not None:
         check_writable(out)
-        write_record(record, out / "compare.json")
-        draw_comparison(comparison, out / "compare.svg")
+        write_record(record, files[".json"])
+        draw_comparison(comparison, files[".svg"])
     return comparison, record
 
 

@@ -35,7 +35,7 @@ from pipeline.files.object_files import ELEMENTS, SIGMAS, GivenImages
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
 from pipeline.resampling.canvas import Canvas, FrameChain
-from pipeline.resampling.resample_stage import FAST, ResampleTask, resample, resample_tasks
+from pipeline.resampling.resample_stage import FAST, ResampleTask, read_description, resample, resample_tasks
 from pipeline.results.comparator_file import (
     ComparatorPoint,
     comparator_from_pixel,
@@ -64,6 +64,8 @@ FEWEST_CONTROL = 3
 _CONSISTENT = 3.0  # largest rms reprojection error of a track, in standard deviations
 _FEWEST_SIGHTS = 3
 _ROUNDS = 5
+_HEAD = "# orientations by COLMAP, as approximations"  # of images.csv
+_FOLDERS = ("pictures", "masks", "sparse")
 MOST_PX = 3000  # pixels along the longer side of a frame, unless the user gives a pitch
 
 
@@ -310,6 +312,7 @@ def run_block(
             f"{project.comparator}: there is no such file. Run `reseau measure` first: it gives the film "
             "transformations."
         )
+    check_folder(project, folder)
     marks = read_comparator(project.comparator, project.list_pitch_um)
     pitch_um = pitch_um or coarse_pitch_um(project)
     seconds = dict[str, float]()
@@ -345,6 +348,24 @@ def run_block(
     return own, left_out, lines
 
 
+def check_folder(project: Project, folder: Path) -> None:
+    """Raise InputError where a file would be replaced that was not written by `reseau block`, or is the project's."""
+    own = {path.resolve() for path in (project.comparator, project.images_path) if path is not None}
+    comparator, images, frames = (folder / name for name in ("comparator.csv", "images.csv", "frames"))
+    is_block = images.is_file() and images.read_bytes().startswith(_HEAD.encode())
+    is_begun = is_block or any(read_description(path) for path in frames.rglob("*.tif"))
+    others = [path for path in (comparator, images) if path.exists() and (not is_block or path.resolve() in own)]
+    if not is_begun:
+        others += [
+            path for path in (*(folder / name for name in _FOLDERS), *folder.glob("colmap.db*")) if path.exists()
+        ]
+    if others:
+        raise InputError(
+            f"{others[0]}: would be replaced, and was not written by `reseau block`, or is the project's. Name another "
+            "folder."
+        )
+
+
 def coarse_pitch_um(project: Project) -> float | None:
     """Pixel pitch that reduces the frames to MOST_PX, so that feature extraction takes minutes; None where the scans
     are already that coarse."""
@@ -369,7 +390,7 @@ def written_block(
     write_comparator(folder / "comparator.csv", kept, pitches)
     exterior: dict[str, Exterior | None] = {}
     lines = [
-        "# orientations by COLMAP, as approximations; elements with standard deviations as they were observed",
+        f"{_HEAD}; elements with standard deviations as they were observed",
         ",".join(("image", *ELEMENTS, *SIGMAS, "camera", "scanner", "part_of")),
     ]
     for image, frame in sorted(frames.items()):

@@ -30,7 +30,13 @@ from pipeline.calibration.intrinsics import (
     choose_lens,
 )
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures, find_turns
-from pipeline.calibration.project_files import CalibrationOptions, board_options, camera_files, write_project
+from pipeline.calibration.project_files import (
+    CalibrationOptions,
+    board_options,
+    camera_files,
+    check_folder,
+    write_project,
+)
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
@@ -146,6 +152,7 @@ def _calibrated(
 ) -> CalibrationResult:
     """Calibrate each camera separately, so that a failure does not affect the others."""
     pictures = find_pictures(given, out)
+    check_folder(out, pictures)
     first: LensModel = "opencv4" if options.lens == "auto" else options.lens
     lenses = dict.fromkeys((camera.name for camera in pictures.cameras), first)
     project = write_project(out, pictures, options, lenses)

@@ -20,13 +20,14 @@ from pipeline.files.project_file import ASSUMED_PITCH_UM, Project, read_project
 from pipeline.files.target_table import TARGET_TABLES, BoardTable
 from pipeline.results.image_unit import CENTRE
 from pipeline.text.csv_table import csv_line
-from pipeline.text.files import make_folder, write_atomically
+from pipeline.text.files import check_replaceable, make_folder, write_atomically
 from pipeline.text.wording import did_you_mean, quoted, table_lines
 
 BoardKind = Literal["chessboard", "charuco", "aprilgrid", "aruco", "circle-grid", "asymmetric-circle-grid"]
 MOST = 500  # largest number of columns or rows in `[targets]`
 KALIBR_SPACING = 0.3  # default gap between the tags of an AprilGrid, in sides of a tag
 MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
+_HEAD = "# Written by `reseau calibrate`"
 OPENCV_COUNTS = (4, 5, 8, 12, 14)  # numbers of coefficients that OpenCV accepts
 
 
@@ -163,6 +164,14 @@ class CalibrationOptions:
         return (self.pitch_um or ASSUMED_PITCH_UM) / 1000.0
 
 
+def check_folder(out: Path, pictures: BoardPictureFiles) -> None:
+    """Raise InputError where a file to be written exists and was not written by `reseau calibrate`."""
+    stems = ["camera", *(camera.name for camera in pictures.cameras)]
+    files = [f"{stem}{ending}" for stem in stems for ending in (".toml", ".yaml", "-ros.yaml")]
+    for name in ("project.toml", "images.csv", *files):
+        check_replaceable(out / name, rf"(%YAML:1\.0\n---\n)?{_HEAD}".encode(), "name another folder with --out")
+
+
 def write_project(
     out: Path, pictures: BoardPictureFiles, options: CalibrationOptions, lenses: Mapping[str, LensModel]
 ) -> Project:
@@ -172,7 +181,7 @@ def write_project(
         write_atomically(out / f"{camera.name}.toml", _camera_text(camera, options, lenses[camera.name]))
     has_lines = len(pictures.cameras) > 1 or any(camera.turned_deg for camera in pictures.cameras)
     if has_lines:
-        lines = ["image,camera,turned_deg"]
+        lines = [_HEAD, "image,camera,turned_deg"]
         for each in pictures.cameras:
             cells = ((name, f"{each.name}.toml", each.turned_deg.get(name) or "") for name in each.images)
             lines += [csv_line([name, file, str(turned)]) for name, file, turned in cells]
@@ -186,7 +195,7 @@ def _project_text(out: Path, pictures: BoardPictureFiles, options: CalibrationOp
     scans = ", ".join(quoted(os.path.relpath(path, out)) for path in files)
     unknown = "" if options.pitch_um else "# The pixel size is not given: of all in mm only ratios count.\n"
     images = 'images = "images.csv"\n' if has_lines else ""
-    return f"""# Written by `reseau calibrate`; `reseau run` goes on with it.
+    return f"""{_HEAD}; `reseau run` goes on with it.
 camera = "{pictures.cameras[0].name}.toml"
 scans = [{scans}]
 {unknown}pitch_um = {1000.0 * options.pixel_mm!r}
@@ -205,7 +214,8 @@ def _camera_text(camera: CameraPictures, options: CalibrationOptions, lens: Lens
     distortion = free_lens(lens, options.square_pixels)
     free = "".join(f'{name} = "free"\n' for name in distortion.parameters)
     width_mm, height_mm = (size * options.pixel_mm for size in (camera.width_px, camera.height_px))
-    return f"""name = {quoted(camera.name)}
+    return f"""{_HEAD}
+name = {quoted(camera.name)}
 frame_mm = [{width_mm!r}, {height_mm!r}]
 principal_distance_mm = {width_mm!r}
 
@@ -232,7 +242,7 @@ def camera_files(cameras: Sequence[CameraIntrinsics], out: Path, ros: bool) -> I
 def opencv_yaml(camera: CameraIntrinsics) -> str:
     """Text for cv2.FileStorage."""
     distortion = _distortion(camera)
-    lines = ["%YAML:1.0", "---"]
+    lines = ["%YAML:1.0", "---", _HEAD]
     lines += [f"image_width: {camera.pictures.width_px}", f"image_height: {camera.pictures.height_px}"]
     lines += _opencv_matrix("camera_matrix", 3, _camera_matrix(camera))
     lines += _opencv_matrix("distortion_coefficients", 1, distortion)
@@ -254,7 +264,7 @@ def ros_yaml(camera: CameraIntrinsics) -> str:
     if model == "plumb_bob":
         distortion = [*distortion, 0.0][:5]
     projection = [value for row in range(3) for value in (*matrix[3 * row : 3 * row + 3], 0.0)]
-    lines = [f"image_width: {camera.pictures.width_px}", f"image_height: {camera.pictures.height_px}"]
+    lines = [_HEAD, f"image_width: {camera.pictures.width_px}", f"image_height: {camera.pictures.height_px}"]
     lines += [f"camera_name: {camera.pictures.name}", *_ros_matrix("camera_matrix", 3, matrix)]
     lines += [f"distortion_model: {model}", *_ros_matrix("distortion_coefficients", 1, distortion)]
     lines += _ros_matrix("rectification_matrix", 3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])

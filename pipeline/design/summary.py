@@ -19,7 +19,7 @@ from pipeline.report.numbers import NONE, fixed, significant, typed, value_and_s
 from pipeline.results.image_unit import UM_PER_MM
 from pipeline.results.record_json import write_record
 from pipeline.terminal import uncut_table
-from pipeline.text.files import check_writable
+from pipeline.text.files import FORMS, check_replaceable, check_writable
 
 WIDE_RANGE = 2.0  # ratio of the largest to the smallest value, from which the axis is logarithmic
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")  # colour-blind safe
@@ -245,6 +245,12 @@ def run_design(scene_path: Path, out_dir: Path | None, reporter: Reporter) -> De
     folder = out_dir or scene_path.with_name(f"{scene_path.stem}-design")
     scene = Variations.read(scene_path)
     setup = scene.setup()
+    files = {"design": folder / "design.json"}
+    for number, each in enumerate(setup.settings.sweep, 1):
+        word = f"sweep of {each.quantity}" if f"sweep of {each.quantity}" not in files else f"sweep {number}"
+        files[word] = folder / f"sweep-{number}-{each.quantity}.svg"
+    for path in files.values():
+        check_replaceable(path, FORMS[path.suffix], "name another folder")
     check_writable(folder)
     with reporter.stage("planning") as count:
         count(scene_path.name, 0, 1)
@@ -256,13 +262,11 @@ def run_design(scene_path: Path, out_dir: Path | None, reporter: Reporter) -> De
         with reporter.stage("trying") as count:
             helpful = alternatives(expected, count)
     swept = []
-    files = {"design": folder / "design.json"}
-    for number, each in enumerate(setup.settings.sweep, 1):
+    _, *plots = files.values()
+    for number, (each, path) in enumerate(zip(setup.settings.sweep, plots, strict=True), 1):
         with reporter.stage("varying") as count:
             swept.append(sweep(scene, number, each, count))
-        word = f"sweep of {each.quantity}" if f"sweep of {each.quantity}" not in files else f"sweep {number}"
-        files[word] = folder / f"sweep-{number}-{each.quantity}.svg"
-        plot_sweep(swept[-1], files[word])
+        plot_sweep(swept[-1], path)
     design = Design(scene.path, expected, without_given, layouts, helpful, tuple(swept), files)
     write_record(design.content(), files["design"])
     return design

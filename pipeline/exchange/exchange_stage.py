@@ -2,6 +2,7 @@
 all files of a folder or none."""
 
 import os
+import re
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,6 +38,7 @@ README = "README.txt"
 SCAN_FORMATS = ("micmac", "mmvii", "metashape")  # whose pixels are those of the scan's file
 ROTATION_ERROR = 1e-3  # of R^T R: rotations are written with four decimals or more
 _HEAD = "Written by reseau"
+_FILES = "\nFiles:\n"
 
 
 def run_export(project: Project, format: str, folder: Path, options: ExportOptions) -> Written:
@@ -89,8 +91,8 @@ def readme(what: str, head: Sequence[str], parts: Mapping[str, Sequence[str]]) -
 
 
 def check_folder(folder: Path) -> None:
-    """Raise InputError for a folder with anything other than an earlier export, which would be overwritten, and for
-    one that the program runs in."""
+    """Raise InputError for a folder with anything other than an earlier export, by the files that its README lists, and
+    for one that the program runs in."""
     if not folder.exists():
         return
     make_folder(folder)
@@ -99,21 +101,27 @@ def check_folder(folder: Path) -> None:
             f"{folder}: is the folder that reseau runs in, or above it, and the whole folder is replaced. Name "
             "another, such as export."
         )
-    text = (folder / README).read_bytes() if (folder / README).is_file() else b""
-    if any(folder.iterdir()) and not text.startswith(_HEAD.encode()):
+    readme_path = folder / README
+    text = readme_path.read_text(encoding="utf-8", errors="replace") if readme_path.is_file() else ""
+    own = {README, *re.findall(r"^- (.*)$", text.partition(_FILES)[2], re.M)} if text.startswith(_HEAD) else set()
+    others = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
+    if found := sorted(set(others) - own)[:1]:
         raise InputError(
-            f"{folder}: holds something that is no export of reseau. Name another folder, or an empty one."
+            f"{folder}: holds something that is no export of reseau, {found[0]}, and is replaced as a whole. Name "
+            "another folder, or an empty one."
         )
 
 
-def publish(folder: Path, files: Mapping[str, str | bytes], readme_text: str) -> None:
-    """Write all files into a new folder that then replaces the earlier one, or the one that a symbolic link names.
+def publish(folder: Path, files: Mapping[str, str | bytes], readme_text: str) -> str:
+    """Write all files into a new folder that then replaces the earlier one, or the one that a symbolic link names, and
+    return the README with the list of files.
 
     Raises InputError for file names that lead out of the folder.
     """
     folder = folder.resolve()
     new = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     old = folder.with_name(f".{folder.name}.{os.getpid()}.old")
+    readme_text = "\n".join([readme_text, f"{_FILES.strip()}", *(f"- {name}" for name in files), ""])
     try:
         all_files = {**files, README: readme_text}
         places = {path_below(folder, name).relative_to(folder): content for name, content in all_files.items()}
@@ -130,6 +138,7 @@ def publish(folder: Path, files: Mapping[str, str | bytes], readme_text: str) ->
     finally:
         for left in (new, old):
             shutil.rmtree(left, ignore_errors=True)
+    return readme_text
 
 
 def run_import(format: str, paths: Sequence[Path], folder: Path, options: ImportOptions) -> Written:
@@ -155,10 +164,9 @@ def run_import(format: str, paths: Sequence[Path], folder: Path, options: Import
             f"images.csv names a camera file for each image, as {folder / next(iter(cameras))}: from the folder "
             "of project.toml.",
         )
-    parts = {"Files": tuple(files), "Notes": notes}
+    parts = {"Notes": notes}
     readme_text = readme(f"import of {format}", ["From:", *(f"- {path.name}" for path in paths)], parts)
-    publish(folder, files, readme_text)
-    return Written(files, notes=notes, readme_text=readme_text)
+    return Written(files, notes=notes, readme_text=publish(folder, files, readme_text))
 
 
 def _unknown_notes(cameras: Sequence[CameraFile]) -> Iterator[str]:

@@ -22,7 +22,12 @@ from pipeline.files.camera_tables import Source
 from pipeline.files.earlier_calibration import EarlierCalibration
 from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_file import Project
-from pipeline.results.adjustment_file import ParameterCovariance, read_own_covariance, write_with_covariance
+from pipeline.results.adjustment_file import (
+    ParameterCovariance,
+    covariance_path,
+    read_own_covariance,
+    write_with_covariance,
+)
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, FiducialRecord, Quantity
 from pipeline.results.comparator_file import read_comparator
 from pipeline.text.files import write_atomically
@@ -84,7 +89,14 @@ def save_cameras(projects: Sequence[Project], folder: Path) -> list[SavedCamera]
             raise InputError(
                 f"{path}: exists and was not written by `reseau cameras --save`. Name another folder with --out."
             )
+        earlier = _calibration_path(path)
+        if not path.exists() and any(each.exists() for each in (earlier, covariance_path(earlier))):
+            raise InputError(f"{earlier}: exists, but no {path.name} to go with it. Name another folder with --out.")
     return [_save(own, files[name]) for name, own in found.items()]
+
+
+def _calibration_path(path: Path) -> Path:
+    return path.with_name(f"{path.stem}-calibration.json")
 
 
 def _calibrations(project: Project) -> list[_Calibration]:
@@ -120,7 +132,7 @@ def _save(calibrations: Sequence[_Calibration], path: Path) -> SavedCamera:
     text = f"adjusted from {counted(frames, 'frame')} of {counted(scanners, 'scanner')} in {archives}"
     labels = {one.label_in_camera: value for one, value in spread.items()}
     source = Source(text=text, frames=frames, scanners=scanners, archives=len(calibrations), spread_mm=labels)
-    earlier = path.with_name(f"{path.stem}-calibration.json")
+    earlier = _calibration_path(path)
     write_with_covariance(earlier, record, ParameterCovariance(first.parameters, values, covariance).arrays)
     camera = _adjusted_camera(first, record.cameras[first.camera.name], earlier, path, source)
     body = camera_text(camera, picture_writer(path.parent, f"{path.stem}-"))

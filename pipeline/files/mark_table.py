@@ -16,7 +16,7 @@ from measure.geometry import POSES
 from measure.marks import shapes
 from measure.marks.shapes import MarkTemplate, Point
 from pipeline.text import table_models as models
-from pipeline.text.files import write_atomically
+from pipeline.text.files import FORMS, check_replaceable, write_atomically
 from pipeline.text.toml_tables import Table
 from pipeline.types import Array
 
@@ -95,6 +95,7 @@ def picture_writer(folder: Path, prefix: str = "") -> SavePicture:
 
     def save(name: str, picture: Picture) -> str:
         file = f"{prefix}{name}.tif"
+        check_replaceable(folder / file, FORMS[".tif"], "give the camera file another name")
         write_atomically(folder / file, picture_file(picture))
         return file
 

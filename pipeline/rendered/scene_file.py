@@ -13,7 +13,7 @@ from measure.marks import shapes
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile, parse_camera, read_camera
 from pipeline.files.library import camera_path
-from pipeline.rendered.scene_project import Given, SceneFile, write_project
+from pipeline.rendered.scene_project import TAKING_CAMERA, Given, SceneFile, write_project
 from pipeline.rendered.scene_tables import DesignSettings, read_field
 from pipeline.text import table_models as models
 from pipeline.text.files import make_folder, quote_value
@@ -22,7 +22,7 @@ from synthetic_images import areas, scene
 from synthetic_images.render import Progress, render_scene
 
 TRUTH = "truth.json"
-WRITTEN = ("project.toml", "camera.toml", "points.csv", "images.csv")
+WRITTEN = ("project.toml", "camera.toml", "points.csv", "images.csv", TAKING_CAMERA, "scans")
 
 
 def render_project(scene_path: Path, out_dir: Path, progress: Progress | None = None) -> None:

@@ -14,7 +14,7 @@ from pipeline.errors import InputError, missing_extra
 from pipeline.report.data import ReportData
 from pipeline.report.lens import lens
 from pipeline.results.adjustment_record import CameraRecord
-from pipeline.text.files import atomic_path, file_word
+from pipeline.text.files import FORMS, atomic_path, check_replaceable, file_word
 from pipeline.types import Array
 
 if TYPE_CHECKING:
@@ -42,8 +42,10 @@ def write_plots(data: ReportData, folder: Path) -> list[Path]:
         for name in _draw(camera, record, figure):
             for ending in ("png", "pdf"):
                 path = folder / f"{file_word(camera.name)}-{name}.{ending}"
+                check_replaceable(path, FORMS[path.suffix], "name another folder")
                 with atomic_path(path) as new:
-                    figure.savefig(new, format=ending, dpi=DPI)
+                    metadata = {"Software" if ending == "png" else "Creator": "reseau"}
+                    figure.savefig(new, format=ending, dpi=DPI, metadata=metadata)
                 files.append(path)
             figure.clear()
     if not files:

@@ -382,6 +382,13 @@ def resample_tasks(
             scans=(scan,),
             doubt=scan_doubt(measured) if is_doubtful and not is_oriented else "",
         )
+    scan_files = {Path(scan_path(each.scan)).resolve() for each in scans}
+    for target in (task.target for task in tasks.values()):
+        if target.resolve() in scan_files or (target.exists() and read_description(target) is None):
+            raise InputError(
+                f"{target}: a resampled frame is to be written there, but the file that stands there is a scan, or was "
+                "not written by `reseau resample`. Name another folder."
+            )
     return list(tasks.values()), failed
 
 

@@ -16,6 +16,14 @@ from pipeline.text.wording import nearest
 MOST_MB = 200  # MB; of what users write
 RESULT_MB = 2000  # MB; adjustment.json of 50,000 film frames has 415, comparator.csv with 100 tie points each 550
 SHOWN = 60  # characters of a wrong value quoted in a message
+_HEAD_BYTES = 4096
+FORMS = {  # beginnings of results, by the file's ending
+    ".json": rb'\s*\{\s*("reseau"|"verdict": "[a-z ]+",\s*"(reason|prob)|"chosen": (null|\{\s*"transformation"))',
+    ".tif": rb"(II|MM).*reseau",
+    ".svg": rb'<svg class="plot" role="img"',
+    ".png": rb"\x89PNG.*reseau",
+    ".pdf": rb"%PDF-1\.4\n%\xac\xdc \xab\xba",  # by Matplotlib
+}
 
 _KINDS = {stat.S_ISFIFO: "a pipe", stat.S_ISCHR: "a device", stat.S_ISBLK: "a device", stat.S_ISSOCK: "a socket"}
 LARGEST = 1e15  # limit of coordinates, sizes and standard deviations, any unit: squares of larger ones lose precision
@@ -147,6 +155,24 @@ def check_writable(folder: Path) -> None:
     """Check before a long computation that its results can be written. Raises WriteError if not."""
     with _temporary_file(folder / f".writable.{os.getpid()}.part", folder) as temporary:
         temporary.touch()
+
+
+def check_replaceable(path: Path, form: bytes, remedy: str) -> None:
+    """Raise InputError for a path where something exists that is no such result: a device, a user's file.
+
+    form: regular expression at the beginning of such results. remedy: what to do if the file is not moved away.
+    """
+    if path.is_dir() or (path.exists() and not path.is_file()):
+        raise InputError(f"{path}: a result is to be written there, but it is no regular file. Name another place.")
+    if not path.exists():
+        return
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
+    if head and not re.match(form, head, re.DOTALL):
+        raise InputError(
+            f"{path}: a result is to be written there, but the file that stands there was not written by reseau. Move "
+            f"it away, or {remedy}."
+        )
 
 
 def no_such_file(path: Path) -> str:

@@ -163,6 +163,12 @@ def test_what_cannot_be_saved_is_refused(archives: Path, tmp_path: Path) -> None
     (tmp_path / "camera.toml").write_text('name = "own"\n')
     with pytest.raises(InputError, match="exists and was not written by"):
         save_cameras([project], tmp_path)
+    (tmp_path / "camera.toml").unlink()
+    (tmp_path / "camera-calibration.npz").write_text("mine")
+    with pytest.raises(InputError, match=r"exists, but no camera\.toml to go with it"):
+        save_cameras([project], tmp_path)
+    for _ in range(2):  # over its own
+        save_cameras([project], tmp_path / "saved")
     other = shutil.copytree(archives / "b", tmp_path / "b", ignore=shutil.ignore_patterns("out"))
     with pytest.raises(InputError, match="no adjustment that converged"):
         save_cameras([read_project(other / "project.toml")], tmp_path / "c")

@@ -25,6 +25,7 @@ from pipeline.files.project_file import read_project
 from pipeline.provenance import hash_file
 from pipeline.report.lens import ANGLES_DEG, certificate
 from pipeline.results.adjustment_file import read_covariance
+from pipeline.text.files import FORMS, check_replaceable
 
 CAMERA = """\
 name = "C"
@@ -161,7 +162,9 @@ def shift_parameter(project: Path, name: str, change_mm: float) -> Path:
     return copy
 
 
-def test_an_unchanged_camera_and_a_changed_one(project: Path, printed: Printed, printed_line: Printed) -> None:
+def test_an_unchanged_camera_and_a_changed_one(
+    project: Path, printed: Printed, printed_line: Printed, refusal: Refusal
+) -> None:
     first = project / "out" / "adjustment.json"
     output = printed_line("compare", first, shift_parameter(project, "same", 0.0))
     assert output.startswith("no drift ")
@@ -174,6 +177,11 @@ def test_an_unchanged_camera_and_a_changed_one(project: Path, printed: Printed, 
     assert "better than independent" not in output
     (largest,) = re.findall(r"Fiducial marks after a similarity: at most ([\d.]+) µm", output)
     assert float(largest) < 0.2  # of their 0.3 um: c and the marks are hardly tied
+    for name in ("compare.json", "compare.svg"):  # its own files may be replaced, others not
+        check_replaceable(out / name, FORMS[Path(name).suffix], "")
+        (project / name).write_text("mine")
+        assert f"{name}: a result is to be written there, but" in refusal("compare", first, first, "--out", project)
+        (project / name).unlink()
     drawn = ElementTree.parse(out / "compare.svg").getroot()
     assert len(drawn.findall(f".//{SVG}ellipse")) == 49  # one a place of the field
     content = json.loads((out / "compare.json").read_text())

@@ -12,12 +12,13 @@ import pytest
 from projects import Capture, Printed, Refusal, command, fiducial_tables, present
 
 from pipeline import InputError
-from pipeline.cli import DONE
+from pipeline.cli import DONE, WRONG_INPUT
 from pipeline.design.expected import alone, alternatives, expect, rms
 from pipeline.design.setup import planned_network, scene_setup
 from pipeline.design.sweeps import Variations, sweep
 from pipeline.rendered.scene_file import read_scene
 from pipeline.rendered.scene_tables import Sweep
+from pipeline.text.files import FORMS, check_replaceable
 
 SCENES = Path(str(resources.files("synthetic_images").joinpath("scenes")))
 SMALL = (
@@ -89,6 +90,15 @@ def test_design_writes_what_it_found(tmp_path: Path, capsys: Capture) -> None:
     folder = tmp_path / "small-design"
     content = json.loads((folder / "design.json").read_text())
     assert content == json.loads(capsys.readouterr().out)
+    files = {each.name: each for each in folder.iterdir()}
+    assert files.keys() == {"design.json", "sweep-1-design.transformation.svg"}
+    for path in files.values():  # its own files may be replaced, others not
+        check_replaceable(path, FORMS[path.suffix], "")
+    plot = files["sweep-1-design.transformation.svg"]
+    drawn = plot.read_bytes()
+    plot.write_text("mine")
+    assert command("design", swept(tmp_path)) == WRONG_INPUT
+    plot.write_bytes(drawn)
     camera, targets = content["cameras"]["K"], content["reliability"]["groups"]["target"]
     assert 0.0 < camera["principal_distance_mm"]["sigma"] < 1.0
     assert [at["radius_mm"] for at in camera["precision_at_radii"]] == pytest.approx(

@@ -18,7 +18,7 @@ from adjust.display import CELLS
 from adjust.functional_model.lens import Lens
 from adjust.quality.lens_uncertainty import distortion_curves
 from measure.flags import NO_REASON, Status
-from pipeline import build_network, read_comparator, read_project
+from pipeline import InputError, build_network, read_comparator, read_project
 from pipeline.drawing.svg import round_step, ticks
 from pipeline.report import Thumbnail, vectors
 from pipeline.report.data import Mark, natural
@@ -28,7 +28,7 @@ from pipeline.report.lens import curves_plot, lens, lens_map
 from pipeline.report.load import report_data
 from pipeline.report.numbers import typed, value_and_sigma
 from pipeline.report.parameters import parameter_rows
-from pipeline.report.plots import calibrated_cameras
+from pipeline.report.plots import calibrated_cameras, write_plots
 from pipeline.results.adjustment_file import ParameterCovariance
 from pipeline.results.adjustment_record import (
     CameraRecord,
@@ -292,6 +292,18 @@ def test_they_show_what_the_adjustment_shows(adjusted_folder: Path) -> None:
         (there_mm, stored_mm), (places_mm, sigma_mm) = plots.uncertainty(distance), of_result.uncertainty(distance)
         np.testing.assert_allclose(np.sort(stored_mm, axis=None), np.sort(sigma_mm, axis=None), rtol=2e-3)
         assert there_mm.shape == places_mm.shape
+
+
+def test_plots_replace_plots_alone(adjusted_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.report.plots._draw", lambda *_: iter(["residuals"]))
+    data = report_data(read_project(adjusted_folder), lambda path: path)
+    for _ in range(2):
+        files = write_plots(data, tmp_path)
+    for path in (next(file for file in files if file.suffix == ending) for ending in (".png", ".pdf")):
+        path.write_text("mine")
+        with pytest.raises(InputError, match="was not written by reseau"):
+            write_plots(data, tmp_path)
+        path.unlink()
 
 
 def test_no_plots(adjusted_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refusal: Refusal) -> None:

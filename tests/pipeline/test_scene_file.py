@@ -204,6 +204,9 @@ def test_a_scene_that_cannot_be_rendered_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"holds camera.toml, which would be overwritten.*Name another folder"):
         render_project(path, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"camera.toml", "scene.toml"}
+    (tmp_path / "own" / "scans").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"holds scans, which would be overwritten"):
+        render_project(path, tmp_path / "own")
     with pytest.raises(InputError, match="cannot be written"):
         render_project(path, path / "out")
     with pytest.raises(InputError, match=r"nowhere\.toml: there is no such file"):
