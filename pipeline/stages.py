@@ -5,7 +5,7 @@ adjustment.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -17,7 +17,7 @@ from pipeline.adjusting.picture_turn import picture_turn
 from pipeline.archive.checked_results import Judging, measured_scans, read_measurement, stored_judging
 from pipeline.archive.made_from import adjusted_from, differing
 from pipeline.archive.results_database import Merged, Store, check_mergeable, merge
-from pipeline.archive.schema import DamagedError
+from pipeline.archive.schema import DamagedError, single_writer
 from pipeline.archive.status import ArchiveStatus, archive_status
 from pipeline.archive.thumbnails import Thumbnails, ThumbnailStore
 from pipeline.archive.verdicts import Verdict
@@ -49,7 +49,7 @@ def run_all(project: Project, reporter: Reporter, work: WorkOptions | None = Non
     if work is not None and work.shard is not None:
         return run_measure(project, reporter, work)
     check_transformation(project)
-    with _running(project, reporter, work) as run:
+    with _running(project, reporter, work, bool(project.scans)) as run:
         scans = read_measurement(project.measurement_path, run.measure()) if project.scans else ()
         try:
             adjustment = run.adjust_twice(scans)
@@ -72,7 +72,7 @@ def run_all(project: Project, reporter: Reporter, work: WorkOptions | None = Non
 
 def run_measure(project: Project, reporter: Reporter, work: WorkOptions | None = None) -> Summary:
     """Measure scans into comparator.csv; a shard only into its own store, for `reseau merge`."""
-    with _running(project, reporter, work) as run:
+    with _running(project, reporter, work, True) as run:
         if work is not None and work.shard is not None:
             part, parts = work.shard
             path = project.shard_path(part, parts)
@@ -96,7 +96,9 @@ def run_merge(project: Project, stores: Sequence[Path], reporter: Reporter) -> t
     """Merge the stores of shards into that of the project; if they hold all its scans, run the cross-scan checks and
     write comparator.csv."""
     check_mergeable(project.measurement_path, stores)
-    with Store(project.measurement_path) as store, ThumbnailStore(store.path) as thumbnails:
+    path = project.measurement_path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with single_writer(path), Store(path) as store, ThumbnailStore(store.path) as thumbnails:
         taken = merge(store, stores)
         thumbnails.take(stores)
     try:
@@ -174,8 +176,12 @@ def run_frame_pages(project: Project, images: Sequence[str], reporter: Reporter)
 
 
 @contextmanager
-def _running(project: Project, reporter: Reporter, work: WorkOptions | None = None) -> Iterator["_Run"]:
-    with unpublished(project) as new:
+def _running(
+    project: Project, reporter: Reporter, work: WorkOptions | None = None, measures: bool = False
+) -> Iterator["_Run"]:
+    shard = work.shard if work is not None else None
+    store = project.measurement_path if shard is None else project.shard_path(*shard)
+    with unpublished(project) as new, single_writer(store) if measures else nullcontext():
         yield _Run(project, new, reporter, work or WorkOptions())
 
 
@@ -236,7 +242,7 @@ class _Run:
             return adjustment
         with self._judging() as before:
             assert before is not None
-            self._write_marks(before.rejudge(again))
+            self._write_marks(before.rejudge(again, project.adjust))
         return adjust_marks(project, self.marks())
 
     def marks(self) -> tuple[comparator_file.ComparatorPoint, ...]:

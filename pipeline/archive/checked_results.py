@@ -25,7 +25,7 @@ from pipeline.archive import schema
 from pipeline.archive.results_database import Store
 from pipeline.archive.verdicts import Verdict, scan_doubt, scan_verdict
 from pipeline.errors import InputError
-from pipeline.provenance import hash_file
+from pipeline.provenance import fingerprint, hash_file
 from pipeline.results.comparator_file import KINDS, CameraPerson, ComparatorPoint, read_measurement_hash
 from pipeline.results.measured_record import (
     Failure,
@@ -183,8 +183,9 @@ class Judging:
         with self.store.writing():
             self.store.connection.execute("delete from judging where digest <> ?", (self.digest,))
 
-    def rejudge(self, scans: Sequence[MeasuredScan]) -> "Judging":
-        """Store a judging of the same results after a second pass, which a later `measure` does not repeat."""
+    def rejudge(self, scans: Sequence[MeasuredScan], settings: object) -> "Judging":
+        """Store a judging of the same results after a second pass, which a later `measure` keeps. settings: of the
+        adjustment."""
         self.check()
         rows = {name: known for name, *known in self.values("name, result, decisions")}
         frames = (
@@ -192,7 +193,13 @@ class Judging:
             for scan in sorted(scans, key=lambda scan: scan.frame.image)
             for result, decisions in [rows[scan.frame.image]]
         )
-        return judge(self.store, self.made_from, f"second pass {self.input}", frames)
+        _, _, first = self.input.rpartition(" ")
+        return judge(self.store, self.made_from, second_pass_input(first, settings), frames)
+
+
+def second_pass_input(input_hash: str, settings: object) -> str:
+    """Input of a judging after a second pass. input_hash: before it."""
+    return f"second pass {fingerprint(settings)} {input_hash}"
 
 
 _PLAIN = """

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from measure.errors import MeasurementError
 from measure.scans.remote import fetch_location, scan_path
-from pipeline.archive.checked_results import Judging, judge_lots, latest
+from pipeline.archive.checked_results import Judging, judge_lots, latest, second_pass_input
 from pipeline.archive.cross_scan_checks import check_lots, find_copies, hash_inputs
 from pipeline.archive.made_from import measured_from
 from pipeline.archive.results_database import Store
@@ -55,11 +55,12 @@ def find_touched(store: Store, project: Project) -> dict[str, str]:
     """Re-key the results of files of another time with the content that was measured; return {old fingerprint: new}."""
     known, hashes = store.identities(), store.content_hashes()
     files, keys = FileStates(project.path.resolve().parent), dict[str, str]()
-    for file in as_named(project.scans).values():
+    reviewed = {one.image for one in project.decisions}
+    for name, file in as_named(project.scans).items():
         state = files.get(file)
         earlier, content = known.get(state.uri), hashes.get(state.uri)
         if earlier and content and state.is_touched(earlier.state) and content_hash(Path(file)) == content:
-            keys |= store.move(state.uri, FileIdentity(state, earlier.parts_hash))
+            keys |= store.move(state.uri, FileIdentity(state, earlier.parts_hash), name in reviewed)
     return keys
 
 
@@ -74,6 +75,7 @@ def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, 
     taken = {state.uri for name, state in states.items() if name not in unknown}
     free = {content: uri for uri, content in store.content_hashes().items() if uri not in taken}
     sizes = {known[uri].state.bytes for uri in free.values()}
+    reviewed = {one.image for one in project.decisions}
     found, keys = 0, dict[str, str]()
     with reporter.stage("recognising scan") as count:
         for done, (name, state) in enumerate(unknown.items(), 1):
@@ -81,7 +83,7 @@ def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, 
             path = project.scans[name]
             uri = free.pop(content_hash(path), "") if state.bytes in sizes else ""
             if uri and uri not in taken:  # nor has another file come to its place
-                keys |= store.move(uri, FileIdentity(state, parts_hash(path)))
+                keys |= store.move(uri, FileIdentity(state, parts_hash(path)), name in reviewed)
                 taken.add(state.uri)
                 found += 1
     if unknown:
@@ -149,7 +151,7 @@ def measure_archive(
         made = measured_from(project)
         input_hash = hash_inputs(tasks, work, copies, made)
         judging = latest(store)
-        if judging is None or judging.input != input_hash:
+        if judging is None or judging.input not in (input_hash, second_pass_input(input_hash, project.adjust)):
             share = partial(tie_scans, learned, reporter=reporter, executor=executor)
             lots = check_lots(learned, tasks, work, copies, share, input_hash)
             judging = judge_lots(store, made, input_hash, lots)

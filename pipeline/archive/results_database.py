@@ -40,6 +40,7 @@ from pipeline.results.measured_record import (
 
 _SQLITE = b"SQLite format 3"  # its files begin with it
 _PLACE = "project folder"
+_MOVED = "moved-result"
 _LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "tifffile", "imagecodecs")
 _PROGRAM = "version, measure_revision, python, libraries"
 
@@ -213,9 +214,9 @@ class Store(Database):
             original = "(select id from scan where name = ?2)"
             self.connection.executemany(f"update scan set duplicate_of = {original} where uri = ?1", copies.items())
 
-    def move(self, uri: str, identity: FileIdentity) -> dict[str, str]:
+    def move(self, uri: str, identity: FileIdentity, is_reviewed: bool = False) -> dict[str, str]:
         """Re-key the results of a scan whose file was moved or touched with unchanged content; return {old fingerprint:
-        new}."""
+        new}. is_reviewed: whether to remember these for `later_keys`."""
         state = identity.state
         with self.writing():
             if uri != state.uri:  # the earlier scan at that place is gone, and its results cannot be requested any more
@@ -232,6 +233,18 @@ class Store(Database):
             ).fetchall()
             keys = {before: result_key(identity, hashed, revision) for before, hashed, revision in results}
             self.connection.executemany("update result set fingerprint = ?2 where fingerprint = ?1", keys.items())
+            if is_reviewed:
+                rows = [(f"{_MOVED} {before}", json.dumps({"fingerprint": now})) for before, now in keys.items()]
+                self.connection.executemany("insert or replace into kept (key, value) values (?, ?)", rows)
+        return keys
+
+    def later_keys(self, key: str) -> set[str]:
+        """The fingerprint of a reviewed result, and those that it has had since its file was moved or touched."""
+        keys = set[str]()
+        moved: Mapping[str, Any] | None = {"fingerprint": key}
+        while moved and (key := moved["fingerprint"]) not in keys:
+            keys.add(key)
+            moved = self.recall(f"{_MOVED} {key}")
         return keys
 
     # --- what scans of a project contribute to others

@@ -3,7 +3,7 @@ effect."""
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -76,6 +76,7 @@ def apply_decisions(
     decisions: Sequence[Decision],
     key_of: Callable[[ScanTask], str],
     pose_of: Callable[[str], str | None],
+    later_keys: Callable[[str], Set[str]] = lambda key: {key},
 ) -> tuple[ScanTask, Mapping[About, Decision]]:
     """Apply decisions to the task of their scan; return it, and the decisions that apply, by subject.
 
@@ -85,13 +86,14 @@ def apply_decisions(
     decisions : about this scan, the oldest first.
     key_of : fingerprint of a task's result.
     pose_of : from the fingerprint of a result, the pose under which its marks are named; None where it is unknown.
+    later_keys : from the fingerprint of a result, all that it has had since then.
     """
     counted, now, key = list[Decision](), task, key_of(task)
     current_keys = {key}  # of the results that a decision may refer to
     ever = set(current_keys)
     for one in decisions:
         known = ever if one.decision is DecisionKind.POSE else current_keys
-        if one.decision is not DecisionKind.UNDO and one.fingerprint and one.fingerprint not in known:
+        if one.decision is not DecisionKind.UNDO and one.fingerprint and not later_keys(one.fingerprint) & known:
             continue
         before, old_key, counted = now, key, [*counted, one]
         now = _apply_to_task(task, standing(counted).values())

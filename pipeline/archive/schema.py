@@ -10,7 +10,7 @@ import math
 import os
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -325,6 +325,33 @@ class Database:
         )
 
 
+@contextmanager
+def single_writer(path: Path) -> Iterator[None]:
+    """Lock a database, for commands that measure into it; the lock ends with the process, however that ends.
+
+    Raises InputError where another process has the lock.
+    """
+    lock = path.with_name(f".{path.stem}.lock")
+    with closing(sqlite3.connect(lock, timeout=0.0, isolation_level=None)) as connection:
+        try:
+            connection.execute("begin exclusive")
+            is_ours = lock.exists()  # else the other process has ended just now
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
+                raise _store_error(lock, MEASUREMENTS, error) from error
+            is_ours = False
+        if not is_ours:
+            raise InputError(
+                f"{path}: another `reseau measure` or `reseau run` is running on this project. Wait until it has "
+                "ended, then run this command again; what it measures is kept."
+            )
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                lock.unlink(missing_ok=True)
+
+
 def opened(path: Path, schema: Schema = MEASUREMENTS) -> sqlite3.Connection:
     """Open a file and migrate it to this version, each step completely or not at all; create it where there is none.
 
@@ -366,11 +393,12 @@ def _connection(path: Path) -> sqlite3.Connection:
 
 
 def _store_error(path: Path, schema: Schema, error: Exception) -> InputError:
-    next_step = what_to_do_about_store(error) or _MOVE
+    next_step = what_to_do_about_store(error) or (_RETRY if isinstance(error, sqlite3.IntegrityError) else _MOVE)
     return InputError(f"{path}: cannot be used as a database of {schema.what} ({error}). {next_step}")
 
 
 _MOVE = "Move it away, and run `reseau measure` again."
+_RETRY = "Run `reseau measure --retry`, which measures again what is damaged."
 
 
 def _check(connection: sqlite3.Connection, path: Path, schema: Schema) -> None:

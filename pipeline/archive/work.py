@@ -171,7 +171,7 @@ class Work:
             if decisions := self.decisions.get(task.name):
                 reviewed_file = identity or FileIdentity(self.state(task), parts_hash(scan_path(task.scan)))
                 reviewed, self.counting[task.name] = review_decisions.apply_decisions(
-                    task, decisions, partial(_key, reviewed_file), pose_of
+                    task, decisions, partial(_key, reviewed_file), pose_of, self._store.later_keys
                 )
             row = None if identity is None else self._rows.get(_key(identity, reviewed))
             if row is None:

@@ -273,6 +273,10 @@ class Session:
                 self._by_key, self._judging = {entry.key: entry for entry in queue}, row
             decisions = decisions_file.read_decisions(path)
             self._standing = decisions_file.standing(decisions)
+            self._later_keys = dict[str, set[str]]()
+            if row != _NONE:
+                with Store(self.project.measurement_path) as store:
+                    self._later_keys = {key: store.later_keys(key) for key in {one.fingerprint for one in decisions}}
             self._learned = [one for one in decisions if one.subject[2] == decisions_file.LEARNED]
             self._of_image = defaultdict[str, list[decisions_file.Decision]](list)
             for one in self._standing.values():
@@ -346,7 +350,7 @@ class Session:
         answer, old = self._answers.get(entry.key), None
         if entry.question not in (Question.CAMERA, Question.FRAME):
             one = self._standing.get((entry.images[0], entry.point, entry.kind))
-            old = None if one is None or _names_result(one, entry.fingerprints[0]) else one  # on an earlier result
+            old = None if one is None or self._names_result(one, entry.fingerprints[0]) else one  # on an earlier result
         return {
             **{name: getattr(entry, name) for name in _SHOWN},
             "image": entry.images[0],
@@ -408,18 +412,22 @@ class Session:
                 return decisions_file.learned_from(self._learned, frozenset(entry.images))
             case Question.FRAME:
                 made = self._scan_decisions(entry.images[0])
-                return next((one for one in reversed(made) if _names_result(one, entry.fingerprints[0])), None)
+                return next((one for one in reversed(made) if self._names_result(one, entry.fingerprints[0])), None)
             case Question.MARK:
                 pose = self._standing.get((entry.images[0], "", ""))
-                if pose is not None and _names_result(pose, entry.fingerprints[0]) and pose.pose != entry.pose:
+                if pose is not None and self._names_result(pose, entry.fingerprints[0]) and pose.pose != entry.pose:
                     return pose  # the mark will have another name
         first = None
         for image, fingerprint in zip(entry.images, entry.fingerprints, strict=True):
             one = self._standing.get((image, entry.point, entry.kind))
-            if one is None or not _names_result(one, fingerprint):
+            if one is None or not self._names_result(one, fingerprint):
                 return None
             first = first or one
         return first
+
+    def _names_result(self, one: decisions_file.Decision, fingerprint: str) -> bool:
+        """Whether a decision refers to the current result."""
+        return not one.fingerprint or fingerprint in self._later_keys.get(one.fingerprint, {one.fingerprint})
 
     def _check(self, one: decisions_file.Decision) -> None:
         """Check that image and mark exist and the decision is possible. Raises InputError otherwise."""
@@ -442,11 +450,6 @@ class Session:
             raise InputError(
                 f"{one.image}, {one.point}: nothing was measured that could be {one.decision}ed. Place it with a click."
             )
-
-
-def _names_result(one: decisions_file.Decision, fingerprint: str) -> bool:
-    """Whether a decision refers to the current result."""
-    return one.fingerprint in ("", fingerprint)
 
 
 def _answer_json(one: decisions_file.Decision) -> Json:

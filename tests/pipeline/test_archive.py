@@ -5,6 +5,8 @@ import os
 import re
 import shutil
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +17,14 @@ import projects
 import pytest
 import tifffile
 from drawn import lay_out
+from projects import Refusal, present
 from studies import parametrize_with_studies
 
 from measure import Code, MarkShape, Reason, ScanOrientation, Status, polygon
 from measure.fiducials.options import BelievedFilm
 from pipeline import read_measurement, read_project
+from pipeline.archive.checked_results import latest
+from pipeline.archive.results_database import Store
 from pipeline.archive.schema import MEASUREMENTS, Schema, opened
 from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_doubt
@@ -28,6 +33,7 @@ from pipeline.measuring.roll import check_scans
 from pipeline.measuring.scan_measurement import MeasuredFile, measure_file
 from pipeline.measuring.scan_task import Measure, ScanTask
 from pipeline.results.measured_record import FailureCode, MeasuredScan
+from pipeline.review.session import Session
 
 measured: list[str] = []  # the images that were measured, in their order
 
@@ -114,6 +120,69 @@ def test_exactly_what_changed_is_measured_again(folder: Path, change: str) -> No
     assert measure(folder) in (0, 1)
     assert not measured
     assert marks(folder) == after
+
+
+def test_decisions_stay_with_results_of_touched_files(folder: Path) -> None:
+    """Touched, touched again, and as old as at first; what a decision names is found in the review, too."""
+    with Store(folder / "out" / "measurement.db") as store:
+        key = store.first("select fingerprint from result join scan on scan.id = scan where name = 'b'")
+    point = next(line.split(",")[1] for line in marks(folder).decode().splitlines() if line.startswith("b,"))
+    line = {"image": "b", "decision": "reject", "point": point, "fingerprint": key}
+    (folder / "decisions.jsonl").write_text(json.dumps(line) + "\n")
+    first_ns = (folder / "b.tif").stat().st_mtime_ns
+    for time_ns in (first_ns, 1, 2, first_ns):
+        os.utime(folder / "b.tif", ns=(time_ns, time_ns))
+        assert measure(folder) in (0, 1)
+        assert not measured
+        (row,) = (row for row in marks(folder).decode().splitlines() if row.startswith(f"b,{point},"))
+        assert ",rejected," in row
+        project = read_project(folder / "project.toml")
+        with Store(project.measurement_path) as store:
+            now = store.first("select fingerprint from result join scan on scan.id = scan where name = 'b'")
+        assert (now == key) is (time_ns == first_ns)
+        assert Session(project, "me")._names_result(project.decisions[0], now)
+
+
+def test_measure_keeps_a_second_pass_until_the_adjustment_has_other_settings(folder: Path) -> None:
+    before, path = marks(folder), folder / "out" / "measurement.db"
+    with Store(path) as store:
+        judging = present(latest(store))
+        scans = [
+            scan.changed([replace(mark, point=f"{mark.point}'") for mark in scan.frame.marks])
+            for scan in judging.scans()
+        ]
+        for _ in range(2):  # of a second pass another one
+            judging = judging.rejudge(scans, read_project(folder / "project.toml").adjust)
+    for _ in range(2):
+        assert measure(folder) in (0, 1)
+        assert marks(folder).count(b"',") == len(scans[0].frame.marks) * 3
+    projects.change_project("[measure]", "[adjust]\nrobust = true\n[measure]")(folder)
+    assert measure(folder) in (0, 1)
+    assert marks(folder).splitlines()[1:] == before.splitlines()[1:]
+
+
+def test_a_second_measure_waits_for_no_other(folder: Path, refusal: Refusal) -> None:
+    """In another process; a killed one leaves nothing behind."""
+    store = folder / "out" / "measurement.db"
+    code = (
+        "import pathlib, time\n"
+        "from pipeline.archive.schema import single_writer\n"
+        f"with single_writer(pathlib.Path({str(store)!r})):\n"
+        "    print('has it', flush=True)\n"
+        "    time.sleep(100)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as other:
+        assert present(other.stdout).readline() == b"has it\n"
+        try:
+            for command in ("measure", "run"):
+                said = refusal(command, folder / "project.toml")
+                assert "another `reseau measure` or `reseau run` is running on this project" in said
+            with Store(store) as reader:
+                assert latest(reader) is not None
+        finally:
+            other.kill()
+    assert measure(folder) in (0, 1)
+    assert not list(store.parent.glob(".*"))
 
 
 def test_results_come_back_by_options_and_move_with_their_project(folder: Path, tmp_path: Path) -> None:
