@@ -156,7 +156,7 @@ class Judging:
     @cached_property
     def plain(self) -> tuple[tuple[str, str, int], ...]:
         """Image, scan's file and row of the result of the frames that are reported only in totals: good ones in which,
-        if they have targets, at least one is observed."""
+        of their targets, tie points and joins, at least one each is observed."""
         rows = self.store.connection.execute(_PLAIN, (self.row, str(Verdict.GOOD)))
         return tuple((name, uri, result) for name, uri, result in rows)
 
@@ -205,7 +205,7 @@ def second_pass_input(input_hash: str, settings: object) -> str:
 _PLAIN = """
 select name, uri, result from checked_frame where judging = ?1 and verdict = ?2 and result not in (
     select result from checked_mark where judging = ?1 and kind <> 'fiducial'
-    group by result having not sum(status in ('measured', 'weak'))
+    group by result, kind having not sum(status in ('measured', 'weak'))
 ) order by name
 """
 

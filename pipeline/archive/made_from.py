@@ -47,12 +47,12 @@ def measured_from(project: Project) -> MadeFrom:
         project.given_points and project.given_points.normals,
         project.given_images and project.given_images.exterior,
         {camera.name: {name: getattr(camera, name) for name in _LENS} for camera in project.cameras.values()},
-        project.film,
         *([project.given_images.part_of] if project.given_images and project.has_parts else []),
     ]
 
     return {
-        SETTINGS: fingerprint(_fields_except(project, _NO_SETTINGS | {"adjust"})),
+        # Of the adjustment's settings those with which fiducials are measured.
+        SETTINGS: fingerprint([_fields_except(project, _NO_SETTINGS | {"adjust"}), project.film]),
         PLACES: fingerprint(places),
         **({DECISIONS: project.decisions_hash} if project.decisions else {}),
         **{

@@ -93,8 +93,8 @@ def frame_verdict(marks: Sequence[MarkState], has_frame: bool, is_doubtful: bool
     if not observed or too_few or (fiducials and not has_frame):
         return Verdict.POOR
     worst = max((mark_verdict(*mark) for mark in marks), key=list(Verdict).index)
-    misses_targets = len(marks) > len(fiducials) and observed.count("fiducial") == len(observed)
-    if is_doubtful or misses_targets or worst is Verdict.LOOK:
+    misses_points = not {kind for kind, *_ in marks if kind != "fiducial"} <= set(observed)  # all of a kind
+    if is_doubtful or misses_points or worst is Verdict.LOOK:
         return Verdict.LOOK
     return Verdict.DECIDED if has_decisions else worst
 

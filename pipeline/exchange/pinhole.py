@@ -118,7 +118,9 @@ def nearest_lens(
     for names in models:
         if _has_only(lens, (*names, "b1")):
             return FittedLens(lens, 0.0)
-    fits, limit_mm = list[FittedLens](), options.largest_misfit_px * min(frame.known_pitch_um) / 1000.0
+    own = (each.known_pitch_um for each in (*block.frames, frame) if each.camera == frame.camera and each.pitch_um)
+    pitch_um = options.pitch_um or min(float(np.sqrt(np.prod(pitch))) for pitch in own)  # the finest of its pictures
+    fits, limit_mm = list[FittedLens](), options.largest_misfit_px * pitch_um / 1000.0
     for names in models:
         fits.append(_fit_opencv(block, frame, names))
         if fits[-1].largest_mm <= limit_mm:

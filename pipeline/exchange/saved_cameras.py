@@ -3,7 +3,8 @@ knowledge for later projects.
 
 Calibrations of one camera from several projects (archives) are combined by their covariances. Differences beyond these
 are described by a variance component between archives, estimated for each quantity separately by the method of moments
-(DerSimonian and Laird, 1986). It is added to the combined variances.
+(DerSimonian and Laird, 1986). It is added to the variances of each archive, and so
+counts in its weight.
 """
 
 import math
@@ -151,14 +152,15 @@ def _combine(calibrations: Sequence[_Calibration]) -> tuple[Array, Array, Mappin
     at = [order[is_free] for order in orders]
     own = [one.values[rows] for one, rows in zip(calibrations, at, strict=True)]
     cofactors = [one.covariance[np.ix_(rows, rows)] for one, rows in zip(calibrations, at, strict=True)]
+    variances = _archive_variances(np.array(own), np.array([np.diag(matrix) for matrix in cofactors]))
+    cofactors = [matrix + np.diag(variances) for matrix in cofactors]
     scale = np.sqrt(np.diag(cofactors[0]))
     normals = [np.linalg.inv(matrix / np.outer(scale, scale)) for matrix in cofactors]
     joint = np.linalg.inv(np.sum(normals, axis=0))
     means = scale * (joint @ np.sum([n @ (x / scale) for n, x in zip(normals, own, strict=True)], axis=0))
-    variances = _archive_variances(np.array(own), np.array([np.diag(matrix) for matrix in cofactors]))
     values, covariance = first.values.copy(), first.covariance.copy()
     values[is_free] = means
-    covariance[np.ix_(is_free, is_free)] = joint * np.outer(scale, scale) + np.diag(variances / len(own))
+    covariance[np.ix_(is_free, is_free)] = joint * np.outer(scale, scale)
     free = [one for one, free in zip(first.parameters, is_free.tolist(), strict=True) if free]
     return values, covariance, dict(zip(free, np.sqrt(variances).tolist(), strict=True))
 

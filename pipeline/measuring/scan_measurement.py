@@ -168,6 +168,9 @@ def misplaced_principal_point(camera: CameraFile, measured: MeasuredScan) -> str
     if camera.fiducials or camera.principal_point_mm is None:
         return ""
     size = comparator_from_pixel(np.array([measured.width_px - 1, measured.height_px - 1]), measured.pitch_um)
+    frame_mm = camera.frame_mm
+    if frame_mm is not None and (frame_mm[0] > frame_mm[1]) != (size[0] > -size[1]):  # a turned picture
+        size = -size[::-1]
     if (np.abs(np.array(camera.principal_point_mm) - size / 2.0) < _IN_THE_PICTURE * np.abs(size)).all():
         return ""
     given, middle = (f"[{x:.4g}, {y:.4g}]" for x, y in (camera.principal_point_mm, (size / 2.0).tolist()))

@@ -23,6 +23,7 @@ LEAST_PROBABILITY = 1e-4  # significance level; low, as target grids nearly para
 LEAST_BIAS_PX = 0.01  # px; with very many marks even a negligible bias is significant
 SAME_PLACE_PX = 0.5  # px; randomly placed marks rarely share a column or row this closely
 
+_POINTS = {"target": "targets", "tie": "tie points", "join": "joins with other parts"}
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 _ONE_ANSWER = (
@@ -219,14 +220,16 @@ def _measurement_problems(frame: ReportedFrame) -> Iterator[ReportedProblem]:
             "Settle them with `reseau review`, or leave them: their standard deviations allow for it.",
             marks=tuple((frame.image, mark.kind, mark.point) for mark in weak),
         )
-    targets = [mark for mark in frame.marks if not mark.is_fiducial]
     is_lost = frame.scan is not None and frame.scan.failure is not None
     is_explained = any({Code.COPY, Code.NO_BOARD} & {*problem.codes} for problem in problems)
-    if targets and not is_lost and not is_explained and not any(mark.status.is_observation for mark in targets):
-        yield ReportedProblem(
-            f"none of its {len(targets)} targets was measured.",
-            "Look at their reasons in comparator.csv: a wrong orientation, scan orientation or diameter misses all.",
-        )
+    for kind, words in _POINTS.items():
+        points = [mark for mark in frame.marks if mark.kind == kind]
+        if points and not is_lost and not is_explained and not any(mark.status.is_observation for mark in points):
+            yield ReportedProblem(
+                f"none of its {len(points)} {words} was measured.",
+                "Look at their reasons in comparator.csv: a wrong orientation, scan orientation or diameter misses "
+                "all.",
+            )
 
 
 def _reasons(lost: list[Mark]) -> str:

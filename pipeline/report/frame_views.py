@@ -12,6 +12,7 @@ from markupsafe import Markup
 from measure.annotations.lines import Line
 from measure.flags import Status
 from measure.geometry import UP_FROM_CAMERA
+from measure.results import ON_FILM
 from pipeline.drawing import svg
 from pipeline.report import vectors
 from pipeline.report.data import Mark, ReportData, ReportedFrame
@@ -205,7 +206,7 @@ def frame_views(data: ReportData, shots: list[ReportedFrame], every_mark: bool =
                 frame=frame,
                 unit=unit,
                 fiducials=_observed_share([mark for mark in frame.marks if mark.is_fiducial]),
-                targets=_observed_share([mark for mark in frame.marks if not mark.is_fiducial]),
+                targets=_observed_share([mark for mark in frame.marks if mark.kind not in ON_FILM]),
                 rms=None if rms is None else (float(rms[0]), float(rms[1])),
                 largest_w=max((abs(row.w) for row in rows if np.isfinite(row.w)), default=None),
                 cards=tuple(_card(data, mark, px_per_um, most_px, suspects) for mark in shown[frame.image]),

@@ -24,6 +24,7 @@ from measure import Code, MarkShape, Reason, ScanOrientation, Status, polygon
 from measure.fiducials.options import BelievedFilm
 from pipeline import read_measurement, read_project
 from pipeline.archive.checked_results import latest
+from pipeline.archive.made_from import differing, measured_from
 from pipeline.archive.results_database import Store
 from pipeline.archive.schema import MEASUREMENTS, Schema, opened
 from pipeline.archive.status import archive_status
@@ -159,6 +160,14 @@ def test_measure_keeps_a_second_pass_until_the_adjustment_has_other_settings(fol
     projects.change_project("[measure]", "[adjust]\nrobust = true\n[measure]")(folder)
     assert measure(folder) in (0, 1)
     assert marks(folder).splitlines()[1:] == before.splitlines()[1:]
+
+
+def test_film_settings_of_the_adjustment_are_settings_of_the_measurement(folder: Path) -> None:
+    made = measured_from(read_project(folder / "project.toml"))
+    for line, names in (("robust = true", []), ("robust = true\nfilm_sigma_um = 7.0", ["settings"])):
+        projects.change_project("[measure]", f"[adjust]\n{line}\n[measure]")(folder)
+        assert differing(made, measured_from(read_project(folder / "project.toml"))) == names
+        projects.change_project(f"[adjust]\n{line}\n[measure]", "[measure]")(folder)
 
 
 def test_a_second_measure_waits_for_no_other(folder: Path, refusal: Refusal) -> None:

@@ -3,7 +3,10 @@
 import json
 import shutil
 import tomllib
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +15,11 @@ from projects import Array, Printed, Refusal, command, present, replace_text, re
 from studies import parametrize_with_studies
 from test_lens_families import two_networks
 
+from adjust.problem.parameter import Parameter
 from measure import FiducialOptions, FrameMeasurement, Status, measure_fiducials, open_scan
 from pipeline import InputError, read_adjustment, read_project
 from pipeline.cli import DONE, LOOK
-from pipeline.exchange.saved_cameras import save_cameras
+from pipeline.exchange.saved_cameras import _Calibration, _combine, save_cameras
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.library import MARK_KINDS, CameraSizes, camera_template
 from pipeline.measuring.scan_measurement import misplaced_principal_point
@@ -158,6 +162,27 @@ def test_two_archives_are_joined_to_what_both_together_give(archives: Path, tmp_
         assert sigma == pytest.approx(np.hypot(joint[name].sigma, spread / np.sqrt(2)), rel=0.15), name
 
 
+@pytest.mark.parametrize(("sigmas", "tau"), [((0.02,) * 9 + (0.002,), 0.02), ((0.02, 0.001), 0.02), ((0.01,) * 4, 0.1)])
+def test_standard_deviations_of_several_archives_hold(sigmas: tuple[float, ...], tau: float) -> None:
+    """Of archives that differ, as precise as one another and not."""
+    c = Parameter.interior("K", "c")
+    record = SimpleNamespace(cameras={"K": SimpleNamespace(distortion=SimpleNamespace(settings=dict))})
+    camera = SimpleNamespace(name="K")
+    made: Any = _Calibration
+
+    def calibration(value: float, sigma: float) -> Any:
+        return made(None, camera, record, (c,), np.array([value]), np.array([[sigma**2]]), 1, 1)
+
+    rng = np.random.default_rng(3)
+    found = []
+    for _ in range(800):
+        drawn = [calibration(rng.normal(100.0, np.hypot(sigma, tau)), sigma) for sigma in sigmas]
+        (value,), ((variance,),), _ = _combine(drawn)
+        found.append((value - 100.0, variance))
+    errors, variances = np.array(found).T
+    assert np.sqrt(np.mean(errors**2) / variances.mean()) == pytest.approx(1.0, abs=0.12)
+
+
 def test_what_cannot_be_saved_is_refused(archives: Path, tmp_path: Path) -> None:
     project = read_project(archives / "a" / "project.toml")
     (tmp_path / "camera.toml").write_text('name = "own"\n')
@@ -214,3 +239,13 @@ def test_a_misplaced_principal_point_is_reported(given: str, rest: str, is_told:
     path.write_text(f'name = "c"\nframe_mm = [40.0, 36.0]\nprincipal_distance_mm = 60.0\n{given}\n{rest}')
     result = misplaced_principal_point(read_camera(path), MEASURED)
     assert ("the middle of this scan is [20, -18]" in result) == is_told
+
+
+def test_a_turned_picture_has_its_principal_point_in_the_sensor(tmp_path: Path) -> None:
+    path = tmp_path / "camera.toml"
+    path.write_text(
+        'name = "c"\nframe_mm = [80.0, 20.0]\nprincipal_point_mm = [40.0, -10.0]\nprincipal_distance_mm = 60.0'
+    )
+    for width_px, height_px in ((4000, 1000), (1000, 4000)):
+        taken = replace(MEASURED, width_px=width_px, height_px=height_px, pitch_um=(20.0, 20.0))
+        assert misplaced_principal_point(read_camera(path), taken) == ""

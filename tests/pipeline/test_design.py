@@ -95,10 +95,10 @@ def test_design_writes_what_it_found(tmp_path: Path, capsys: Capture) -> None:
     for path in files.values():  # its own files may be replaced, others not
         check_replaceable(path, FORMS[path.suffix], "")
     plot = files["sweep-1-design.transformation.svg"]
-    drawn = plot.read_bytes()
+    svg = plot.read_bytes()
     plot.write_text("mine")
     assert command("design", swept(tmp_path)) == WRONG_INPUT
-    plot.write_bytes(drawn)
+    plot.write_bytes(svg)
     camera, targets = content["cameras"]["K"], content["reliability"]["groups"]["target"]
     assert 0.0 < camera["principal_distance_mm"]["sigma"] < 1.0
     assert [at["radius_mm"] for at in camera["precision_at_radii"]] == pytest.approx(

@@ -56,7 +56,7 @@ from pipeline.exchange import exchange_stage, micmac_format, pinhole
 from pipeline.exchange.block import OutFrame, read_block
 from pipeline.exchange.formats import FORMATS, IMPORTED, ExportOptions
 from pipeline.exchange.geojson_format import lon_lat
-from pipeline.exchange.pinhole import frame_corners_mm
+from pipeline.exchange.pinhole import FittedLens, frame_corners_mm, nearest_lens
 from pipeline.exchange.tables import _check_words
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.results import adjustment_content
@@ -362,6 +362,21 @@ def test_the_nearest_of_several_models_is_named(tmp_path: Path, refusal: Refusal
     message = refusal("export", project, "opencv", tmp_path / "a")
     assert float(message.split("off by up to ")[1].split()[0]) < 0.1
     exported(project, "opencv", tmp_path, "--misfit-px", "0.1")
+
+
+def test_a_model_is_chosen_in_pixels_of_the_frames_written(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lens 3 µm off fits in pixels of 100 µm, and not in those of 20 µm, of --pitch-um or of another picture."""
+    block = read_block(read_project(project))
+    frame = next(iter(block.oriented()))
+    fits = {1: 0.003, 2: 0.0}
+    monkeypatch.setattr(
+        "pipeline.exchange.pinhole._fit_opencv", lambda block, frame, names: FittedLens(frame.lens, fits[len(names)])
+    )
+    models, allowed = (("k1",), ("k1", "k2")), ExportOptions(largest_misfit_px=0.05)
+    assert nearest_lens(block, frame, models, allowed).largest_mm == 0.003
+    assert nearest_lens(block, frame, models, replace(allowed, pitch_um=20.0)).largest_mm == 0.0
+    finer = replace(block, frames=(*block.frames[:-1], replace(block.frames[-1], pitch_um=(20.0, 20.0))))
+    assert nearest_lens(finer, frame, models, allowed).largest_mm == 0.0
 
 
 def test_an_export_is_replaced_whole(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

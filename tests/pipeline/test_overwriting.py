@@ -45,7 +45,7 @@ def test_scans_are_not_replaced_by_resampled_frames(tmp_path: Path, monkeypatch:
     monkeypatch.setattr("pipeline.resampling.resample_stage.read_comparator", lambda *_: ())
     path = tmp_path / "scans" / "1.tif"
     path.parent.mkdir()
-    scan = replace(made_record(1), scan=path)
+    scan = replace(made_record(1), scan=str(path))
     monkeypatch.setattr("pipeline.resampling.resample_stage.read_measurement", lambda _: [scan])
     project = read_project(tmp_path / "project.toml")
     description = '{"reseau": "1", "x_mm": 0, "y_mm": 0, "pitch_mm": 1}'
@@ -54,7 +54,7 @@ def test_scans_are_not_replaced_by_resampled_frames(tmp_path: Path, monkeypatch:
         with pytest.raises(InputError, match="is a scan, or was not written by `reseau resample`"):
             resample_tasks(project, tmp_path / "scans", None, False, BEST)
         assert len(resample_tasks(project, tmp_path / "frames", None, False, BEST)[0]) == 1
-    other = replace(scan, scan=tmp_path / "other.tif")
+    other = replace(scan, scan=str(tmp_path / "other.tif"))
     monkeypatch.setattr("pipeline.resampling.resample_stage.read_measurement", lambda _: [other])
     assert len(resample_tasks(project, tmp_path / "scans", None, False, BEST)[0]) == 1  # an earlier result
 

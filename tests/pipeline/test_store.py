@@ -14,6 +14,7 @@ import pytest
 from projects import FOLDER, changed, comparator_points, content, failed, kept_result, made_record, present, stored
 
 from measure import Code, Reason, Status
+from measure.results import Kind
 from pipeline import InputError
 from pipeline.archive.checked_results import CheckedResult, Judging, Lot, find_judging, judge, judge_lots, latest
 from pipeline.archive.results_database import Store, check_mergeable
@@ -202,6 +203,12 @@ def test_verdicts_of_scans() -> None:
     for status, verdict in ((Status.WEAK, Verdict.GOOD), (Status.REJECTED, Verdict.LOOK)):
         targets = (target, replace(target, point="u", status=status))
         verdicts.append((replace(good, frame=replace(good.frame, marks=(*good.frame.marks, *targets))), verdict))
+    kinds: list[tuple[Kind, Verdict]] = [("tie", Verdict.LOOK), ("join", Verdict.LOOK), ("target", Verdict.GOOD)]
+    for kind, verdict in kinds:
+        points = (target, replace(target, kind=kind, point="u", status=Status.MEASURED))
+        verdicts.append((good.changed([*good.frame.marks, *points]), verdict))
+    elsewhere = replace(target, kind="fiducial", status=Status.ABSENT, reason=Reason("it lies in f1b", Code.OTHER_PART))
+    verdicts.append((good.changed([*good.frame.marks, elsewhere]), Verdict.GOOD))
     assert [scan_verdict(scan) for scan, _ in verdicts] == [verdict for _, verdict in verdicts]
     assert set(NEXT_STEP) == set(Verdict)
     for scan, verdict in verdicts:  # the summary, and so the exit code, say the same
