@@ -908,7 +908,9 @@ def rename_frame(frame: Frame, pose: str) -> Frame:
     renamed = Frame.from_placement(frame.scan, frame.layout, placement, frame.options)
     renamed = replace(renamed, weights=frame.weights, channel_note=frame.channel_note)
     places = {name: place for name, place in zip(names, found, strict=True) if name >= 0}
-    renamed = orient_frame(_detect(renamed, places, 0.0, places_px=places))
+    # The first fits have the strain of the interior orientation under the names before.
+    for _ in range(2):
+        renamed = orient_frame(_detect(renamed, places, 0.0, places_px=places))
     unclear = [index for index, each in enumerate(renamed.detections) if not each.is_clear]
     renamed = refit_frame(detect_missing_marks(orient_frame(_detect(renamed, unclear, renamed.first_search_px))))
     return renamed if renamed.inliers.sum() >= frame.inliers.sum() else frame

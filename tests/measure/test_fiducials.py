@@ -9,6 +9,8 @@ from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
 from measure import Code, FiducialOptions, MarkShape, Status, dot, polygon, ring_cross
+from measure.fiducials.measure_frame import rename_frame
+from measure.fiducials.stages import find_frame
 from measure.geometry import POSES
 from measure.marks.shapes import Disk, Part, finest_detail_mm
 
@@ -127,6 +129,22 @@ def test_marks_places_decide_where_they_are_not_symmetric() -> None:
     result = draw.measure_grey(draw.frame_picture(uneven, matrix), uneven)
     assert draw.found_pose(result) == ("90", True), result.pose
     draw.assert_right(result, uneven, matrix)
+
+
+def test_marks_renamed_are_drawn_without_the_strain_of_their_names_before() -> None:
+    """Noise had been twice as large, and places that are right within 0.02 px were known to 0.4 px."""
+    places = (6.9, 6.55), (-7.0, 6.85), (-6.4, -7.0), (6.7, -6.35)
+    uneven = draw.lay_out([MarkShape(draw.RING_CROSS)] * 4, places)
+    scan = draw.make_scan(draw.frame_picture(uneven, draw.pixel_from_camera("180m")))
+    pitch_um = draw.PITCH_UM, draw.PITCH_UM
+    turned, known = (find_frame(scan, uneven, pitch_um, FiducialOptions(pose=pose)).frame for pose in ("90", "180m"))
+    assert turned is not None
+    assert known is not None
+    assert (turned.placement.pose, known.placement.pose) == ("90", "180m")
+    renamed = rename_frame(turned, "180m").inlier_fits
+    for index, fit in known.inlier_fits.items():
+        assert renamed[index].noise_dn == pytest.approx(fit.noise_dn, rel=0.05)
+        np.testing.assert_allclose(renamed[index].center_px, fit.center_px, atol=0.003)
 
 
 def test_dark_marks_and_an_unknown_pitch() -> None:
