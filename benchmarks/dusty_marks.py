@@ -8,7 +8,7 @@ from drawn import make_scan
 from numpy.typing import NDArray
 from true_marks import KIND, Kind, TrueMark, some_mark
 
-from benchmarks.measured_marks import CONTRAST, GROUND, FoundMarks
+from benchmarks.measured_marks import CONTRAST, GROUND, Found
 from measure.fiducials.constellation import Placement
 from measure.flags import Status
 from measure.geometry import POSES
@@ -35,7 +35,7 @@ class DustyMark:
     mark: TrueMark
     grey: Array
     visible: Mask
-    found: FoundMarks | None
+    found: Found | None
 
     @property
     def flagged(self) -> bool:
@@ -111,7 +111,5 @@ def frame_of_disks(
     for each, (*_, corner) in zip(measure_disks(make_scan(frame), predictions), parts, strict=True):
         place, flagged = each.center_px, "" if each.status is Status.MEASURED else each.reason
         given = each.status.is_observation and place is not None and each.covariance_px2 is not None
-        found.append(
-            FoundMarks(np.asarray(place) - corner, np.asarray(each.covariance_px2), flagged) if given else None
-        )
+        found.append(Found(np.asarray(place) - corner, np.asarray(each.covariance_px2), flagged) if given else None)
     return [DustyMark(*part[:3], each) for part, each in zip(parts, found, strict=True)], dusts

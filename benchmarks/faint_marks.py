@@ -16,7 +16,7 @@ from true_marks import KIND, KINDS, Kind, TrueMark, some_mark
 
 from benchmarks.dusty_marks import BLUR_SPREAD, PX_PER_MM, frame_layout, start_placement
 from benchmarks.harness import Row
-from benchmarks.measured_marks import CONTRAST, GROUND, Cell, FoundMarks, best_errors
+from benchmarks.measured_marks import CONTRAST, GROUND, Cell, Found, best_errors
 from measure.fiducials.measure_frame import measure_frame
 from measure.fiducials.options import FiducialOptions
 from measure.marks.shapes import FiducialLayout
@@ -62,7 +62,7 @@ def drawn_frame(kind: Kind, blur_px: float, rng: np.random.Generator) -> DrawnFr
 
 def measured_faint(
     frame: DrawnFrame, snr: float, rng: np.random.Generator
-) -> Iterator[tuple[TrueMark, FoundMarks | None, Array]]:
+) -> Iterator[tuple[TrueMark, Found | None, Array]]:
     """Measure a frame; yield each faint mark, its result, None if not found, and the noise in its window in units of
     its contrast."""
     sign = int(rng.choice((-1, 1)))
@@ -83,7 +83,7 @@ def measured_faint(
     result = measure_frame(scan, frame.layout, placement, FiducialOptions())
     for number in FAINT:
         fit = result.inlier_fits.get(number)
-        found = None if fit is None else FoundMarks(fit.center_px - frame.corners[number], fit.covariance_px2)
+        found = None if fit is None else Found(fit.center_px - frame.corners[number], fit.covariance_px2)
         yield frame.marks[number], found, noises[number]
 
 

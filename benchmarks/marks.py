@@ -18,16 +18,7 @@ from numpy.typing import NDArray
 from true_marks import KIND, KINDS, Kind, TrueMark, grain_correlation, grainy, some_mark, whitened_rms
 
 from benchmarks.harness import Row, rms, table
-from benchmarks.measured_marks import (
-    CONTRAST,
-    GROUND,
-    Cell,
-    FoundMarks,
-    best_errors,
-    draw_mark,
-    measure_mark,
-    start_off,
-)
+from benchmarks.measured_marks import CONTRAST, GROUND, Cell, Found, best_errors, draw_mark, measure_mark, start_off
 from measure.scans.jpeg import rounding_step_dn
 
 Array = NDArray[np.float64]
@@ -170,7 +161,7 @@ def jpeg(kind: Kind, _part: float, count: int, seeds: list[int]) -> Row:
     return row
 
 
-def measure_jpeg(mark: TrueMark, contrast: float, quality: int, rng: np.random.Generator) -> FoundMarks | None:
+def measure_jpeg(mark: TrueMark, contrast: float, quality: int, rng: np.random.Generator) -> Found | None:
     noise = white(mark.size, rng) / JPEG_SNR
     shown, step_dn = compressed(draw_mark(mark, rng, contrast, 60.0)[0] + contrast * noise, quality, rng)
     return measure_mark(mark, shown, rng, 255, step_dn=step_dn)

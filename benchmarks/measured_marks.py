@@ -21,7 +21,7 @@ SHIFT_PX, SEARCH_PX = 1.5, 3.0  # px, error of the start, and radius of the sear
 
 
 @dataclass(frozen=True, eq=False)
-class FoundMarks:
+class Found:
     """Measured place with its covariance. flagged: reason if `weak` or not measured, "" otherwise; unlike_drawing_px2:
     covariance of the cause model misfit."""
 
@@ -45,7 +45,7 @@ class Cell:
     bounds: list[Array] = field(default_factory=list)
     lost: int = 0
 
-    def add(self, mark: TrueMark, found: FoundMarks | None, best: Array, bound: Array) -> None:
+    def add(self, mark: TrueMark, found: Found | None, best: Array, bound: Array) -> None:
         if found is None or found.flagged:
             self.lost += 1
             return
@@ -111,14 +111,14 @@ def measure_mark(
     full_scale: int = 65535,
     step_dn: float = 0.0,
     off: Array | None = None,
-) -> FoundMarks | None:
+) -> Found | None:
     """Measure a mark by the program's functions, from a start with an error of up to SHIFT_PX, and off (n,) from
     `start_off`."""
     scan = make_scan(grey, full_scale, step_dn)
     center = mark.place[:, 2] + rng.uniform(-SHIFT_PX, SHIFT_PX, 2)
     if mark.kind.name == "ellipse":
         disk = fit_disk(scan, mark.place[:, 2] + rng.normal(0, 0.4, 2), mark.place[:, :2] * rng.uniform(0.9, 1.1))
-        return None if disk.reason else FoundMarks(disk.center_px, disk.covariance_px2, disk.weakness)
+        return None if disk.reason else Found(disk.center_px, disk.covariance_px2, disk.weakness)
     off = start_off(mark, rng) if off is None else off
     change = np.tensordot(off, np.reshape(ALL_MOVES[: len(off)], (-1, 2, 2)), 1)
     start = np.column_stack([(np.eye(2) + change) @ mark.place[:, :2], center])
@@ -130,7 +130,7 @@ def measure_mark(
         return None
     unlike_drawing_px2 = fit.place_covariance.parts.get(Cause.UNLIKE_DRAWING, np.zeros((2, 2)))
     flagged = "damaged" if fit.damaged_fraction > CLEAR_DAMAGE else ""
-    return FoundMarks(fit.center_px, fit.covariance_px2, flagged, unlike_drawing_px2)
+    return Found(fit.center_px, fit.covariance_px2, flagged, unlike_drawing_px2)
 
 
 def grey_is_light(mark: TrueMark, grey: Array) -> bool:

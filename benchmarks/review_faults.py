@@ -120,11 +120,8 @@ def case(seed: int, folder: Path | None = None) -> Row:
     with nullcontext(folder) if folder else TemporaryDirectory() as place:
         folder = Path(place)
         folder.mkdir(parents=True, exist_ok=True)
-        truths, project, session = (
-            planted(folder, np.random.default_rng(seed)),
-            folder / "project.toml",
-            BrowserSession(),
-        )
+        truths = planted(folder, np.random.default_rng(seed))
+        project, session = folder / "project.toml", BrowserSession()
         reseau("measure", project)
         before = rows(folder)
         for _ in range(ROUNDS):
