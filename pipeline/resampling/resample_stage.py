@@ -42,7 +42,7 @@ from pipeline.results.comparator_file import read_comparator
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.files import atomic_path, check_writable, path_below
 from pipeline.types import Array, Mask, Samples
-from pipeline.workers import worker_pool
+from pipeline.workers import WorkerKilled, worker_pool
 
 _BAND_PX = 256  # rows decoded at a time into the scratch file
 Degree = Literal[3, 5]
@@ -337,7 +337,11 @@ def resample(
     with reporter.stage("resampled frame") as count, worker_pool(max(len(tasks), 1)) as workers:
         futures = {workers.submit(resampled, task): task for task in tasks}
         for done, future in enumerate(as_completed(futures), 1):
-            results.append(future.result())
+            try:
+                results.append(future.result())
+            except Exception as error:  # its process was killed, or its memory full: the other frames go on
+                reason = str(error) if isinstance(error, WorkerKilled) else f"{type(error).__name__} {error}".rstrip()
+                results.append(Resampled(futures[future].image, None, problem=reason))
             count(futures[future].image, done, len(futures))
     return tuple(sorted(results, key=lambda result: result.image))
 

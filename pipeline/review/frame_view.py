@@ -110,7 +110,8 @@ class ReviewFrame:
         if mark.center_px is not None and "second_method_col_px" in mark.quality:
             offset_px = (mark.quality["second_method_col_px"], mark.quality["second_method_row_px"])
             second = np.add(mark.center_px, offset_px)
-        parts = mark.covariance.parts.items() if mark.covariance else ()
+        is_known = mark.covariance_px2 is not None and np.isfinite(mark.covariance_px2).all()
+        parts = mark.covariance.parts.items() if mark.covariance and is_known else ()
         parts_px = [(c.shown, c.meaning, float(np.sqrt(max(np.trace(px2) / 2, 0.0)))) for c, px2 in parts]
         parts_px.sort(key=lambda one: -one[2])  # the largest first
         return {
@@ -120,7 +121,7 @@ class ReviewFrame:
             "predicted": _pair(self.predicted_px(point, kind)),
             "second": _pair(second),
             "half": self.window_px(point, kind),
-            "covariance": None if mark.covariance_px2 is None else mark.covariance_px2.tolist(),
+            "covariance": mark.covariance_px2.tolist() if mark.covariance_px2 is not None and is_known else None,
             "causes": [{"cause": cause, "meaning": meaning, "sigma_px": px} for cause, meaning, px in parts_px],
             "quality": {name: value for name, value in mark.quality.items() if np.isfinite(value)},
             "outlines": [] if drawn is None or linear is None else outlines_px(drawn.mark, linear),

@@ -156,7 +156,7 @@ _CHECKED = "select verdict, fingerprint from checked_frame where name = ? and ju
 _NEARBY = """
 with own as (
     select judging, scan, camera from checked_frame
-    where name = ?1 and judging = (select max(id) from judging)
+    where name = ?1 and judging = (select max(id) from judging where digest not like 'unfinished%')
 )
 select f.name from own join checked_frame f
 on f.judging = own.judging and f.scan between own.scan - ?2 and own.scan + ?2

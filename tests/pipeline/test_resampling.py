@@ -1,11 +1,14 @@
 """Scans in their camera's frame: a picture of known formula through every pose, through a lens, and as a file."""
 
 import json
+from concurrent.futures import Future
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -20,18 +23,22 @@ from adjust.functional_model.transformation import Film
 from measure import MeasurementError, ScanOrientation, open_scan
 from measure.flags import Code, Reason
 from pipeline.files.project_file import read_project
+from pipeline.progress import Reporter
 from pipeline.resampling.canvas import Canvas, FrameChain, outline_canvas, scan_places
 from pipeline.resampling.resample_stage import (
     BEST,
     FAST,
     TILE_PX,
     FrameScan,
+    Resampled,
     ResampleTask,
     _tile_row_height_px,
     open_source,
+    resample,
     resample_tasks,
     resampled,
 )
+from pipeline.workers import WorkerKilled
 
 Array = NDArray[np.float64]
 
@@ -300,6 +307,27 @@ def test_a_frame_whose_place_in_the_scan_is_in_doubt_says_so(tmp_path: Path, mon
         monkeypatch.setattr(f"{stage}.current_adjustment", lambda *given, adjustment=adjustment: adjustment)
         tasks, _ = resample_tasks(written, tmp_path, None, False, BEST)
         assert [task.doubt for task in tasks] == ["", doubt, false_alarm[0]]
+
+
+def test_a_killed_process_costs_its_own_frame_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    errors = {"1": WorkerKilled(), "2": MemoryError(), "3": None}
+
+    def submit(_: object, one: ResampleTask) -> Future[Resampled]:
+        future, error = Future[Resampled](), errors[one.image]
+        if error is not None:
+            future.set_exception(error)
+        else:
+            future.set_result(Resampled(one.image, one.target))
+        return future
+
+    stage = "pipeline.resampling.resample_stage"
+    chain = FrameChain(PITCH_UM, film(0.4, False)[0])
+    tasks = [replace(task(tmp_path / "a.tif", tmp_path, chain), image=image) for image in errors]
+    monkeypatch.setattr(f"{stage}.resample_tasks", lambda *given: (tasks, []))
+    monkeypatch.setattr(f"{stage}.worker_pool", lambda count: nullcontext(SimpleNamespace(submit=submit)))
+    done = resample(Mock(), tmp_path, None, False, False, Reporter(quiet=True))
+    problems = ["its process was ended, most likely because the memory was full", "MemoryError", ""]
+    assert [one.problem for one in done] == problems
 
 
 def test_a_scan_that_is_gone_is_a_result(tmp_path: Path) -> None:

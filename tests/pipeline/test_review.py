@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sqlite3
 import time
 import tracemalloc
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,7 +19,7 @@ import review_server as review
 import tifffile
 from browser import browser_page, needs_browser
 from playwright.sync_api import Browser, Page, expect
-from projects import Capture, Printed, command, write_project
+from projects import Capture, Printed, command, copied, write_project
 
 from measure.fiducials.options import Click, FiducialOptions
 from measure.flags import Cause, Code, Reason, Status
@@ -234,6 +235,26 @@ def test_the_next_question_that_is_left_is_reported_wherever_it_stands(measured_
         session.decide([Decision(*about, fingerprint=entry["fingerprint"])])
     assert session.page(Filters(), start=1)["next_left"] == 0
     assert session.page(Filters(question="mark"))["next_left"] == -1
+
+
+def test_a_mark_of_unknown_precision_is_shown_and_an_unfinished_judging_is_none(
+    measured_folder: Path, tmp_path: Path
+) -> None:
+    session = Session(read_project(copied(measured_folder, tmp_path / "copy")), "bob")
+    view = next(view for view in map(session.view, session.project.scans) if view.scan.frame.marks)
+    names = [(image, one.point) for image in session.project.scans for one in session.view(image).scan.frame.marks]
+    similar = {name: session.similar_frames(*name, "fiducial") for name in names}
+    assert any(similar.values())
+    unknown = Covariance.from_noise(np.diag([np.inf, np.inf]))
+    marks = [replace(mark, covariance=unknown) for mark in view.scan.frame.marks]
+    frame = replace(view.scan.frame, marks=tuple(marks))
+    shown = replace(view, scan=replace(view.scan, frame=frame)).detail_json(marks[0].point, marks[0].kind)
+    assert json.loads(json.dumps(shown, allow_nan=False))["covariance"] is None
+    with sqlite3.connect(session.project.measurement_path) as database:  # as `reseau measure` begins one
+        columns = [row[1] for row in database.execute("pragma table_info(judging)") if row[1] not in ("id", "digest")]
+        values = ", ".join(columns)
+        database.execute(f"insert into judging (digest, {values}) select 'unfinished 1', {values} from judging limit 1")
+    assert {name: session.similar_frames(*name, "fiducial") for name in names} == similar
 
 
 def test_a_wide_window_takes_little_memory_and_shows_the_scan_in_its_place(tmp_path: Path) -> None:
