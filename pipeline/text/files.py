@@ -7,8 +7,9 @@ import re
 import stat
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from pipeline.errors import InputError, WriteError, what_to_do
 from pipeline.text.wording import nearest
@@ -38,7 +39,7 @@ def split_lines(text: str) -> list[str]:
 
 
 @contextmanager
-def regular_file(path: Path) -> Iterator[BinaryIO]:
+def regular_file(path: Path) -> Iterator[BufferedReader]:
     """Open a file for reading.
 
     Raises FileNotFoundError and IsADirectoryError, for which the caller has a better message, and InputError for a file

@@ -89,7 +89,7 @@ def picture(number: int) -> NDArray[np.uint8]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("board")
     for number in range(len(TURNS)):
-        Image.fromarray(picture(number)).save(made / "own" / f"p{number}.png")
+        Image.fromarray(picture(number)).save(made / f"p{number}.png")
     return made
 
 
