@@ -106,7 +106,7 @@ def import_(
         shared.command_step("template project > project.toml", why=f"and name the files of {folder} in it"),
         shared.command_step("run", "project.toml"),
     )
-    return shared.DONE
+    return shared.LOOK if done.left_out else shared.DONE
 
 
 def convert(

@@ -23,7 +23,13 @@ from pipeline.files.project_tables import UNITS_MM
 from pipeline.resampling.canvas import FrameChain, image_chain
 from pipeline.results.adjustment_file import ParameterCovariance, read_own_covariance
 from pipeline.results.adjustment_record import AdjustmentRecord
-from pipeline.results.comparator_file import ComparatorPoint, pixel_from_comparator, read_comparator, read_pitches
+from pipeline.results.comparator_file import (
+    ComparatorPoint,
+    has_pixels_alone,
+    pixel_from_comparator,
+    read_comparator,
+    read_pitches,
+)
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.types import Array
 
@@ -235,6 +241,8 @@ def read_block(project: Project) -> ImageBlock:
     marks = read_comparator(project.comparator, project.list_pitch_um)
     adjustment = current_adjustment(project, marks)
     pitches = read_pitches(project.comparator)
+    if project.list_pitch_um is not None and has_pixels_alone(project.comparator):
+        pitches = dict.fromkeys((mark.image for mark in marks), project.list_pitch_um)
     by_image: dict[str, list[ComparatorPoint]] = {mark.image: [] for mark in marks}
     for mark in marks:
         if mark.status.is_observation:

@@ -164,9 +164,10 @@ def run_import(format: str, paths: Sequence[Path], folder: Path, options: Import
             f"images.csv names a camera file for each image, as {folder / next(iter(cameras))}: from the folder "
             "of project.toml.",
         )
-    parts = {"Notes": notes}
+    parts = {"Notes": notes} | ({"Left out": incoming.left_out} if incoming.left_out else {})
     readme_text = readme(f"import of {format}", ["From:", *(f"- {path.name}" for path in paths)], parts)
-    return Written(files, notes=notes, readme_text=publish(folder, files, readme_text))
+    readme_text = publish(folder, files, readme_text)
+    return Written(files, notes=notes, left_out=incoming.left_out, readme_text=readme_text)
 
 
 def _unknown_notes(cameras: Sequence[CameraFile]) -> Iterator[str]:

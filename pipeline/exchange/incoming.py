@@ -142,13 +142,15 @@ class ImportOptions:
 
 @dataclass(frozen=True)
 class Incoming:
-    """Content of another program's files. notes: remarks for the user; tables: files that are written as they are."""
+    """Content of another program's files. notes: remarks for the user; tables: files that are written as they are;
+    left_out: what cannot be read, with the reasons."""
 
     marks: tuple[ForeignMark, ...] = ()
     cameras: tuple[CameraFile, ...] = ()
     poses: tuple[ForeignPose, ...] = ()
     notes: tuple[str, ...] = ()
     tables: dict[str, str] = field(default_factory=dict)
+    left_out: tuple[str, ...] = ()
 
 
 def opencv_camera(

@@ -516,7 +516,7 @@ def import_colmap(paths: Sequence[Path], options: ImportOptions) -> Incoming:
     """Read folders of reconstructions (.bin or .txt): orientations as approximations, and cameras of the models that
     OpenCV has."""
     pycolmap = import_pycolmap("the format colmap")
-    cameras, poses, notes = [], [], []
+    cameras, poses, notes, left_out = [], [], [], list[str]()
     for path in paths:
         folder = path if path.is_dir() else path.parent
         try:
@@ -529,7 +529,7 @@ def import_colmap(paths: Sequence[Path], options: ImportOptions) -> Incoming:
         for number, camera in sorted(made.cameras.items()):
             known = _parameters(camera)
             if known is None:
-                notes.append(f"Camera {number} is of the model {camera.model_name}, which is not read.")
+                left_out.append(f"Camera {number} is of the model {camera.model_name}, which is not read.")
                 continue
             interior, lens = known
             size = (camera.width, camera.height)
@@ -545,7 +545,7 @@ def import_colmap(paths: Sequence[Path], options: ImportOptions) -> Incoming:
                 )
     poses.sort(key=lambda pose: pose.image)
     notes.append("The exterior orientations are approximations, in the coordinates of that reconstruction.")
-    return Incoming(cameras=tuple(cameras), poses=tuple(poses), notes=tuple(notes))
+    return Incoming(cameras=tuple(cameras), poses=tuple(poses), notes=tuple(notes), left_out=tuple(left_out))
 
 
 def _parameters(camera: Any) -> tuple[list[float], dict[str, float]] | None:

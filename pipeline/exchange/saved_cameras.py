@@ -50,7 +50,7 @@ class _Calibration:
     values: Array
     covariance: Array
     frames: int
-    scanners: int
+    scanners: frozenset[str]  # by name; those without one are each archive's own
 
 
 @dataclass(frozen=True)
@@ -114,12 +114,11 @@ def _calibrations(project: Project) -> list[_Calibration]:
         own = tuple(one for one in values if one.kind in _ONE_CAMERA and one.owner == camera.name)
         images = record.camera_images(camera.name)
         frames = {record.images[image].part_of or image for image in images}
-        scanners = {project.image_scanner(image) for image in images}
+        given = project.given_images.scanner if project.given_images else {}
+        scanners = frozenset(given.get(image) or f"of {project.path}" for image in images)
         numbers = np.array([values[one] for one in own])
         found.append(
-            _Calibration(
-                project, camera, record, own, numbers, covariance.select_larger(own), len(frames), len(scanners)
-            )
+            _Calibration(project, camera, record, own, numbers, covariance.select_larger(own), len(frames), scanners)
         )
     return found
 
@@ -128,7 +127,8 @@ def _save(calibrations: Sequence[_Calibration], path: Path) -> SavedCamera:
     first = calibrations[0]
     values, covariance, spread = _combine(calibrations)
     record = _replace_quantities(first, dict(zip(first.parameters, values.tolist(), strict=True)), covariance)
-    frames, scanners = sum(one.frames for one in calibrations), sum(one.scanners for one in calibrations)
+    frames = sum(one.frames for one in calibrations)
+    scanners = len(frozenset[str]().union(*(one.scanners for one in calibrations)))
     archives = listed([one.project.title for one in calibrations])
     text = f"adjusted from {counted(frames, 'frame')} of {counted(scanners, 'scanner')} in {archives}"
     labels = {one.label_in_camera: value for one, value in spread.items()}

@@ -26,6 +26,7 @@ from pipeline import InputError, build_network, read_adjustment, read_comparator
 from pipeline.adjusting import adjust_stage
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.cli import DONE, LOOK
+from pipeline.exchange.block import read_block
 from pipeline.opencv_check.check import check_against_opencv
 from pipeline.report import ReportData
 from pipeline.report.verdict import judge
@@ -350,6 +351,10 @@ def test_a_digital_camera_comes_from_pixels_alone(tmp_path: Path, line: str, pit
             abs(result.value(key) / pitch_mm - nets.BOARD_TRUTH[name] / DRAWN_MM) < 4.0 * result.sigma(key) / pitch_mm
         )
     assert any("5 µm are assumed" in note for note in result.unused) == (not line)
+    frame = read_block(read_project(tmp_path / "project.toml")).frames[0]
+    cells = (tmp_path / "comparator.csv").read_text().splitlines()[1].split(",")
+    place = next(px for mark, px in zip(frame.marks, frame.pixels(frame.marks), strict=True) if mark.point == cells[1])
+    np.testing.assert_allclose(place, [float(cells[2]), float(cells[3])])  # exported as it came
 
 
 def test_a_camera_file_in_mm_needs_the_size_of_a_pixel(tmp_path: Path) -> None:

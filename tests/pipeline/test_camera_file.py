@@ -22,6 +22,7 @@ from pipeline.cli import DONE, LOOK
 from pipeline.exchange.saved_cameras import _Calibration, _combine, save_cameras
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.library import MARK_KINDS, CameraSizes, camera_template
+from pipeline.files.object_files import GivenImages
 from pipeline.measuring.scan_measurement import misplaced_principal_point
 from pipeline.rendered.scene_file import render_project
 from pipeline.results.adjustment_record import Quantity
@@ -171,7 +172,7 @@ def test_standard_deviations_of_several_archives_hold(sigmas: tuple[float, ...],
     made: Any = _Calibration
 
     def calibration(value: float, sigma: float) -> Any:
-        return made(None, camera, record, (c,), np.array([value]), np.array([[sigma**2]]), 1, 1)
+        return made(None, camera, record, (c,), np.array([value]), np.array([[sigma**2]]), 1, frozenset())
 
     rng = np.random.default_rng(3)
     found = []
@@ -181,6 +182,21 @@ def test_standard_deviations_of_several_archives_hold(sigmas: tuple[float, ...],
         found.append((value - 100.0, variance))
     errors, variances = np.array(found).T
     assert np.sqrt(np.mean(errors**2) / variances.mean()) == pytest.approx(1.0, abs=0.12)
+
+
+@pytest.mark.parametrize(("names", "count"), [(("V850", "V850"), 1), (("V850", "V800"), 2), (("", ""), 2)])
+def test_a_scanner_of_two_archives_is_one(
+    names: tuple[str, str], count: int, archives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = "pipeline.exchange.saved_cameras.current_adjustment"
+    monkeypatch.setattr(stage, lambda project, marks: read_adjustment(project.adjustment_path))
+    projects = []
+    for folder, name in zip("ab", names, strict=True):
+        project = read_project(archives / folder / "project.toml")
+        images = read_adjustment(project.adjustment_path).images
+        projects.append(replace(project, given_images=GivenImages({}, {}, dict.fromkeys(images, name))))
+    (saved,) = save_cameras(projects, tmp_path / "saved")
+    assert saved.source.scanners == count
 
 
 def test_what_cannot_be_saved_is_refused(archives: Path, tmp_path: Path) -> None:

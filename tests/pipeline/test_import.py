@@ -15,7 +15,7 @@ from adjust.functional_model.distortion_models import TORLEGARD_NAMES
 from adjust.functional_model.lens import Lens, Prior
 from adjust.problem.camera import FiducialDistance
 from pipeline import InputError, read_images
-from pipeline.cli import DONE, WRONG_INPUT
+from pipeline.cli import DONE, LOOK, WRONG_INPUT
 from pipeline.exchange.certificate import fit, read_certificate
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.results.comparator_file import read_comparator, read_pitches
@@ -175,6 +175,15 @@ def test_wrong_files_are_refused(format: str, text: str, words: str, tmp_path: P
     assert command("import", format, file, tmp_path / "o", *PITCH, "--sigma-px", "1") == WRONG_INPUT
     assert words in capfd.readouterr().err
     assert not (tmp_path / "o").exists()
+
+
+def test_a_camera_that_is_not_read_needs_a_look(tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 100 100 50 50 50 50\n2 FOV 100 100 50 50 50 50 0.1\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 1 2 3 1 a.jpg\n\n")
+    (tmp_path / "points3D.txt").write_text("")
+    assert command("import", "colmap", tmp_path, tmp_path / "out", *PITCH) == LOOK
+    assert "Left out: - Camera 2 is of the model FOV, which is not read." in " ".join(capsys.readouterr().out.split())
+    assert (tmp_path / "out" / "camera.toml").exists()
 
 
 def test_an_image_and_a_certificate_are_given_once(tmp_path: Path, refusal: Refusal) -> None:
