@@ -36,7 +36,7 @@ from pipeline.calibration import calibrate_stage, intrinsics
 from pipeline.calibration.calibrate_stage import CalibrationResult
 from pipeline.calibration.intrinsics import LensChoice, LensModel, choose_lens
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures
-from pipeline.calibration.project_files import CalibrationOptions, board_options, write_project
+from pipeline.calibration.project_files import CalibrationOptions, board_options, check_folder, write_project
 from pipeline.files.target_table import read_targets
 from pipeline.measuring.repeated_views import check_repeated_views
 from pipeline.opencv_check.check import BoardPictures, compare_corners, detector_name, find_points
@@ -224,6 +224,7 @@ def test_a_folder_of_pictures_gives_intrinsics_in_pixels(result: dict[str, Any],
     assert (enlarged < 1.5).all()
     assert covariance[4, 5] < -0.5 * sigmas[4] * sigmas[5]  # k1 and k2 take one another's place
     assert "distortion_model: plumb_bob" in (out / "camera-ros.yaml").read_text()
+    check_folder(out, find_pictures([calibrated_folder], out))  # the command may write over its own files
     report = (out / "out" / "report.html").read_text()
     assert re.search(r"fx = 520\.\d+ ± 0\.\d+ px", report)
     checked_cy = re.search(r"<td>cy</td><td[^>]*>px</td><td[^>]*>([^<]*)</td>", report)
