@@ -194,7 +194,7 @@ def _calibrated(
     project = write_project(out, calibrated, options, lenses)
     if any(name != earlier for earlier, name in names.items()):  # the cameras left out had folders of their own
         left_out = {names[image]: why for image, why in left_out.items() if image in names}
-        marks = [replace(mark, image=names[mark.image]) for mark in marks if mark.image in names]
+        marks = tuple(replace(mark, image=names[mark.image]) for mark in marks if mark.image in names)
         for camera in calibrated.cameras:
             own = [mark for mark in marks if mark.image in camera.images and mark.image not in left_out]
             adjustments[camera.name] = adjust_marks(project, own)
