@@ -192,7 +192,7 @@ def test_an_adjustment_with_too_simple_a_film_advises_the_one_that_made_it(film:
     assert f'transformation = "{film}"' in explanations[0].remedy
 
 
-def test_reasons_name_the_criterion_that_decided() -> None:
+def test_reasons_name_the_deciding_criterion() -> None:
     chosen = candidate("k3", 300.0, 1.0)
     others = {
         "is too simple: what it lacks is significant, F(1, 299) = ": candidate("", 320.0, 1.1),

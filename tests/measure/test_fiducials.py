@@ -114,7 +114,7 @@ def test_a_pose_of_the_user_that_the_picture_contradicts_is_reported() -> None:
 
 
 @pytest.mark.study
-def test_a_set_orientation_in_which_nothing_fits_is_told_with_the_one_that_does() -> None:
+def test_a_set_orientation_in_which_nothing_fits_is_named_with_the_one_that_does() -> None:
     """As where y of the given coordinates has the wrong sign: tone or camera were blamed."""
     uneven = draw.lay_out([MarkShape(draw.RING_CROSS)] * 4, ((7.0, -7.0), (-7.0, -6.4), (-7.0, 5.6), (5.8, 7.0)))
     matrix = draw.pixel_from_camera("180m")

@@ -679,7 +679,7 @@ def test_points_that_no_image_shows_are_a_note_and_an_unknown_one_in_one_image_i
 
 
 @pytest.mark.parametrize("other", ["F1.TIF", "f1.dng"])
-def test_names_of_one_image_that_differ_by_case_and_ending_need_a_look(
+def test_names_of_one_image_that_differ_by_case_and_ending_are_named(
     other: str, tmp_path: Path, printed_line: projects.Printed
 ) -> None:
     project = projects.adjusted_project(tmp_path)

@@ -184,8 +184,8 @@ def test_a_second_measure_waits_for_no_other(folder: Path, refusal: Refusal) -> 
         assert present(other.stdout).readline() == b"has it\n"
         try:
             for command in ("measure", "run"):
-                said = refusal(command, folder / "project.toml")
-                assert "another `reseau measure` or `reseau run` is running on this project" in said
+                sentence = refusal(command, folder / "project.toml")
+                assert "another `reseau measure` or `reseau run` is running on this project" in sentence
             with Store(store) as reader:
                 assert latest(reader) is not None
         finally:

@@ -177,7 +177,7 @@ def test_wrong_files_are_refused(format: str, text: str, words: str, tmp_path: P
     assert not (tmp_path / "o").exists()
 
 
-def test_a_camera_that_is_not_read_needs_a_look(tmp_path: Path, capsys: Capture) -> None:
+def test_a_camera_that_is_not_read_ends_with_exit_code_1(tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 100 100 50 50 50 50\n2 FOV 100 100 50 50 50 50 0.1\n")
     (tmp_path / "images.txt").write_text("1 1 0 0 0 1 2 3 1 a.jpg\n\n")
     (tmp_path / "points3D.txt").write_text("")

@@ -98,7 +98,7 @@ def test_block_writes_over_no_comparator_and_images_but_its_own(
 
 
 @pytest.mark.parametrize("words", [("export", "csv"), ("import", "opencv")])
-def test_files_put_beside_an_export_stay(
+def test_files_that_a_user_adds_to_an_export_stay(
     words: tuple[str, str], adjusted: Path, mine: Callable[[str], Path], tmp_path: Path, refusal: Refusal
 ) -> None:
     arguments: tuple[object, ...] = ("export", adjusted, "csv", tmp_path / "out")
