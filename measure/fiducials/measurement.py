@@ -316,9 +316,7 @@ def present_frame(
         marks = tuple(_unmeasured(mark.id, each, place, chance) for mark, each, place in places)
         return FrameMeasurement(frame.scan.name, marks, pose, problems=tuple(problems), weights=frame.weights)
     for altered in find_alterations(frame.scan):
-        own_px2 = (np.zeros((2, 2)) if each.fit is None else each.fit.covariance_px2 for each in frame.detections)
-        parts = ({altered.cause: altered.covariance(px2)} for px2 in own_px2)
-        detections = (each.amend(parts=part) for each, part in zip(frame.detections, parts, strict=True))
+        detections = (each.amend(parts={altered.cause: altered.px2}) for each in frame.detections)
         frame, problems = replace(frame, detections=tuple(detections)), (*problems, altered.reason)
     unnamed = next((problem for problem in problems if Code.AMBIGUOUS in problem.codes), NO_REASON)
     marks = tuple(_row(mark, index, frame, pose, chance, unnamed) for index, mark in enumerate(frame.layout.marks))

@@ -1,13 +1,9 @@
-"""Scans altered as a whole before they came, told by what this leaves everywhere: nearest neighbours, interpolation,
-and motion.
+"""Scans altered as a whole before they came, told by what this leaves everywhere: nearest neighbours, and motion.
 
 Turned or scaled with nearest neighbours, every pixel was copied from the nearest one of the source. Under a small turn
 rows jump sideways by one pixel at regular distances, and columns in the other direction at the same distances. Under a
 small enlargement rows or columns stand twice at regular distances. A mark between two steps was moved as a whole, by up
 to half a pixel along each axis, and shows nothing of it.
-
-Interpolation at a regular spacing smooths most where it falls between two pixels: rows and columns are rough at a
-period that the scale gives (Gallagher, 2005, Detection of linear and cubic interpolation in JPEG compressed images).
 
 Motion along a line multiplies the power spectrum of the scan by a squared sinc across that line. Its zeros tell it from
 texture and lens, whose spectra are smooth. Where a line of a mark became a bar of even grey, its fit lies anywhere in
@@ -18,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import fft
-from scipy.ndimage import maximum_filter1d, median_filter
+from scipy.ndimage import median_filter
 
 from measure.array_types import Array, Single
 from measure.flags import Cause, Code, Reason
@@ -29,16 +25,12 @@ _LEAST_DISTANCE_PX = 16  # between steps: several in a mark average out
 _FEWEST_STEPS = 4
 _MOSTLY = 0.75  # fraction of the distances between rows that are alike
 _AROUND = 25  # rows whose median is what the picture's own slanted lines make
-_CLOSELY_AROUND = 15  # the same for roughness, whose periods are shorter
 _MOST_SIGMAS = 6.0  # jumps are limited to as many: single ones may be anything
 _OUTLYING, _MOST_OUTLYING = 3.0, 100  # standard deviations of rows whose distances are tried, and their largest number
 _DISTANCES = 8  # that are tried, those between most of these rows
 _SIGNIFICANT = 5.0  # standard deviations of a regular jump: film, compressed, sharpened or clipped, reaches 4.5
 _BLOCK_PX = 8  # of JPEG, whose grid rows and columns show as well
 _FEW_BLOCKS = 5  # at fewer, thirds of blocks show, too
-_PERIODS, _ALL_NEAR = 16384, 7  # frequencies of the roughness that are sampled, and how many of them a line is wide
-_LOWEST, _OFF_GRID = 0.05, 0.0022  # per pixel: least frequency of a line, and least distance from those of the grid
-_STANDS_OUT = 100.0  # times the median power; film that is not interpolated reaches 59
 _TILE_PX, _FEWEST_TILES = 64, 8  # squares whose power spectra are taken, and how many of them tell motion
 _MOST_TILES = 256  # more take time, and tell hardly more
 _LEAST_DN = 0.5  # standard deviation of grey values in such a square
@@ -60,17 +52,11 @@ class Alteration:
     reason : what it is, what it does to marks, and what to do.
     cause : of the part of each mark's covariance that stands for it.
     px2 : (2, 2) that part.
-    pixels : number of pixels that are worth one: that part has the mark's own covariance as often, less once.
     """
 
     reason: Reason
     cause: Cause
     px2: Array
-    pixels: float = 1.0
-
-    def covariance(self, own_px2: Array) -> Array:
-        """(2, 2) part of a mark's covariance; own_px2: the rest of it."""
-        return self.px2 + (self.pixels - 1) * own_px2
 
 
 _NEAREST = Alteration(
@@ -82,16 +68,6 @@ _NEAREST = Alteration(
     Cause.INTERPOLATION,
     np.eye(2) / 12,  # errors are uniform over a pixel
 )
-_INTERPOLATED = Alteration(
-    Reason(
-        "The scan was enlarged or reduced by interpolation: its pixels are not independent, and standard deviations "
-        "are doubled. Measure the scan that it was made from.",
-        Code.IMPRECISE,
-    ),
-    Cause.INTERPOLATION,
-    np.zeros((2, 2)),
-    pixels=4.0,  # enlarged to twice the size; which scale it is the period leaves open
-)
 
 
 def find_alterations(scan: Scan) -> list[Alteration]:
@@ -101,7 +77,7 @@ def find_alterations(scan: Scan) -> list[Alteration]:
         return []
     if _is_nearest_neighbour(*strips):
         return [_NEAREST, *_motion(strips)]
-    return [*([_INTERPOLATED] if _is_interpolated(strips) else []), *_motion(strips)]
+    return _motion(strips)
 
 
 def _strips(scan: Scan) -> tuple[Single, Single]:
@@ -117,7 +93,7 @@ def _strips(scan: Scan) -> tuple[Single, Single]:
 
 def _is_nearest_neighbour(rows: Single, columns: Single) -> bool:
     """Whether a scan was turned or enlarged with nearest neighbours, by strips of it."""
-    jumps, alike = (_jumps(rows), -_jumps(columns)), [-_roughness(each, 1) for each in (rows, columns)]
+    jumps, alike = (_jumps(rows), -_jumps(columns)), [-_roughness(each) for each in (rows, columns)]
     if any(_are_regular([sign * each for each in jumps]) for sign in (1, -1)):
         return True
     # Rows that stand twice are still alike after compression.
@@ -140,15 +116,15 @@ def _jumps(rows: Single) -> Array:
     return _standardised(better.mean(axis=1, dtype=float))
 
 
-def _roughness(rows: Single, order: int, around: int = _AROUND) -> Array:
-    """(n - order,) logarithm of the mean difference of an order between rows, in standard deviations."""
-    size = np.abs(np.diff(rows, order, axis=0)).mean(axis=1, dtype=float)
-    return _standardised(np.log(np.maximum(size, 1e-3)), around)
+def _roughness(rows: Single) -> Array:
+    """(n - 1,) logarithm of the mean difference of each row to the one before, in standard deviations."""
+    size = np.abs(np.diff(rows, axis=0)).mean(axis=1, dtype=float)
+    return _standardised(np.log(np.maximum(size, 1e-3)))
 
 
-def _standardised(rows: Array, around: int = _AROUND) -> Array:
+def _standardised(rows: Array) -> Array:
     """(n,) values of rows less the median around, in limited standard deviations."""
-    beyond = rows - median_filter(rows, around)
+    beyond = rows - median_filter(rows, _AROUND)
     scaled = beyond / max(float(beyond.std()), np.finfo(float).tiny)
     return np.asarray(np.clip(scaled, -_MOST_SIGMAS, _MOST_SIGMAS))
 
@@ -181,20 +157,6 @@ def _regular_jump(jumps: Array, distance: float) -> float:
     steps = int(len(jumps) / distance)
     firsts = np.floor(np.arange(steps) * distance).astype(int)
     return float(jumps[firsts[:, None] + np.arange(int(distance))].sum(axis=0).max() / np.sqrt(steps))
-
-
-def _is_interpolated(strips: tuple[Single, Single]) -> bool:
-    """Whether the roughness of rows and columns has a common period, other than those of a grid of blocks."""
-    frequency = fft.rfftfreq(_PERIODS)
-    off_grid = np.abs(frequency * _BLOCK_PX - np.rint(frequency * _BLOCK_PX)) / _BLOCK_PX > _OFF_GRID
-    return bool(np.min([_lines(each) for each in strips], axis=0)[off_grid & (frequency > _LOWEST)].max() > _STANDS_OUT)
-
-
-def _lines(rows: Single) -> Array:
-    """(frequencies,) power of the roughness of rows by its frequency, over the median."""
-    roughness = _roughness(rows, 2, _CLOSELY_AROUND)
-    power = np.abs(fft.rfft(roughness * np.hanning(len(roughness) + 2)[1:-1], _PERIODS)) ** 2
-    return np.asarray(maximum_filter1d(power, _ALL_NEAR) / max(float(np.median(power)), np.finfo(float).tiny))
 
 
 def _motion(strips: tuple[Single, Single]) -> list[Alteration]:

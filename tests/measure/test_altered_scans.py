@@ -6,10 +6,10 @@ from functools import lru_cache
 import cv2
 import numpy as np
 import pytest
-from drawn import ALIKE, PITCH_UM, Array, center, frame_picture, make_scan, measure_grey, pixel_from_camera
+from drawn import ALIKE, Array, center, frame_picture, make_scan, measure_grey, pixel_from_camera
 from scipy.ndimage import convolve, gaussian_filter
 
-from measure import Code, Status, measure_fiducials
+from measure import Code, Status
 from measure.flags import Cause
 from measure.noise.resampling import find_alterations
 
@@ -67,14 +67,6 @@ def test_nearest_neighbours_are_found_under_compression() -> None:
     assert causes(jpeg(nearest(film(), 0.0, (1.012, 1.012)), 90)) == [Cause.INTERPOLATION]
 
 
-@pytest.mark.parametrize("kind", [cv2.INTER_LINEAR, cv2.INTER_CUBIC])
-@pytest.mark.parametrize("scale", [1.2, 1.5])
-def test_enlarged_scans_are_found(scale: float, kind: int) -> None:
-    enlarged = cv2.resize(film(), None, fx=scale, fy=scale, interpolation=kind)
-    (found,) = find_alterations(make_scan(np.rint(enlarged), 255))
-    assert (found.cause, found.pixels) == (Cause.INTERPOLATION, 4.0)
-
-
 @pytest.mark.parametrize(
     ("length_px", "slope", "named"),
     [(3, (1, 0), "3 px along rows"), (5, (0, 1), "5 px along columns"), (5, (1, -1), "to the right by 135 degrees")],
@@ -122,14 +114,3 @@ def test_marks_of_a_scan_blurred_by_motion_may_lie_anywhere_in_the_blur() -> Non
         assert mark.covariance is not None
         assert mark.covariance.parts[Cause.MOTION] == pytest.approx(np.diag([2.0, 0.0]), rel=0.1, abs=1e-9)
         assert np.abs(center(mark) - matrix @ (*given.xy_mm, 1.0)).max() < 1.0
-
-
-def test_standard_deviations_of_an_enlarged_scan_are_doubled() -> None:
-    matrix, random = pixel_from_camera("0"), np.random.default_rng(7)
-    picture = frame_picture(ALIKE, matrix)
-    enlarged = cv2.resize(picture + random.normal(0.0, 3.0, picture.shape), None, fx=1.1, fy=1.1)
-    result = measure_fiducials(make_scan(np.rint(enlarged)), ALIKE, (PITCH_UM / 1.1, PITCH_UM / 1.1))
-    assert [Code.IMPRECISE in problem.codes for problem in result.problems] == [True]
-    for mark in result.marks:
-        assert mark.covariance is not None
-        assert mark.covariance.parts[Cause.INTERPOLATION] == pytest.approx(0.75 * mark.covariance.px2)
