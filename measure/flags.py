@@ -147,10 +147,7 @@ class Cause(MeaningfulWord):
     SECOND_METHOD = "second method", "Disagreement with the position from its edges."
     GIVEN_PLACES = "given places", "Disagreement with the given coordinates."
     OTHER_FRAMES = "other frames", "Disagreement with the camera's other frames."
-    INTERPOLATION = (
-        "interpolation",
-        "Interpolation between two scans, of a scan enlarged or reduced, or none: nearest neighbours.",
-    )
+    INTERPOLATION = "interpolation", "Interpolation between two scans, or none: nearest neighbours."
     MOTION = "motion", "Motion blur of the whole scan: the place lies anywhere in it."
     CLICK = "click", "A person pointed at it, and nothing could be matched there."
     LENS = "taking lens", "Uncertainty of the lens that photographed the film, from its calibration."
