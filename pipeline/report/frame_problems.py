@@ -217,7 +217,7 @@ def _measurement_problems(frame: ReportedFrame) -> Iterator[ReportedProblem]:
     if weak:
         yield ReportedProblem(
             f"{counted(len(weak), 'weak fiducial mark')}. Reasons: {_reasons(weak)}.",
-            "Settle them with `reseau review`, or leave them: their standard deviations allow for it.",
+            "Settle them with `reseau review`, or leave them: they count with the larger standard deviations given.",
             marks=tuple((frame.image, mark.kind, mark.point) for mark in weak),
         )
     is_lost = frame.scan is not None and frame.scan.failure is not None
