@@ -25,17 +25,12 @@ from adjust.problem.problem import Problem, number_reduced
 from adjust.problem.unknowns import Reduction
 from adjust.quality.variance_components import added_variance
 from adjust.rank_defect.datum import held_as_known
-from adjust.solution.blunder_hypotheses import (
-    Trials,
-    blunder_sentence,
-    check_plausibility,
-    exchanged_fiducials,
-    misnumbered_images,
-    orientations_elsewhere,
-)
+from adjust.solution.blunder_hypotheses import Trials, blunder_sentence, orientations_elsewhere
 from adjust.solution.coordinate_blunders import CoordinateBlunder, find_coordinate_blunders
 from adjust.solution.options import Datum, Method, Options
+from adjust.solution.plausibility import check_plausibility
 from adjust.solution.result import Adjustment, adjust_problem
+from adjust.solution.wrong_names import exchanged_fiducials, misnumbered_images
 from adjust.validation import validate
 
 __all__ = ["Datum", "Method", "Options", "adjust", "adjust_unmodelled"]

@@ -2,43 +2,27 @@
 
 Mirrored points or exchanged axes, another unit, y pointing down, exchanged frames, mirrored images, a wrong principal
 distance. Such a blunder leaves residuals everywhere, and tests of single observations would reject good ones.
-
-Others contradict the geometry of photographs, independent of the residuals: marks outside the image, stations on both
-sides of an opaque board, a principal point outside the image or far from its given place. On a flat board a mirrored
-image has the same residuals as a correct one, with its station on the other side; y pointing down mirrors all images.
-The mirrored network is adjusted, and its sigma0 is reported where it explains all observations.
-
-The projective transformation of the given points to an image tells wrong numbers without a camera: with right ones it
-fits but for the distortion, which all images share. Images that it fits worse by far are tried with other numbers.
 """
 
-import re
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, combinations, product
-from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial.distance import cdist
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtrc
 
-from adjust.array_types import Array, Indices, Mask
+from adjust.array_types import Array, Mask
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
-from adjust.initial_values.dlt import linear_transformations
-from adjust.problem.camera import Camera
-from adjust.problem.condition_equations import observed_in_camera
 from adjust.problem.estimates import adjusted_image, adjusted_places
-from adjust.problem.network import Image, Network, ObjectPoint
+from adjust.problem.network import Network, ObjectPoint
 from adjust.problem.parameter import shortened
 from adjust.solution.result import Adjustment
+from adjust.solution.wrong_names import LARGE, NAMED, transformed_fields
 
 TOLERATED = 2.0  # factor on the given standard deviations up to which residuals need no explanation
 CHECKED = 10  # smallest redundancy for an explanation
-NAMED = 5  # images named in a message
 WORST, RARE = 3, 1e-3  # frames of a camera tried with another one; ratio of likelihoods to be exceeded by one trial
 MOST_PAIRS = 15  # pairs of frames tried as exchanged, largest residuals first
 ONE_AXIS = 10.0  # sigma0 that one axis in another unit leaves at least
@@ -47,19 +31,6 @@ NEAR = 0.3  # fraction of its distance from the field's centre that a station ma
 PITCHES = (10.0, 25.4, 100.0, 1000.0, 2.0)  # ratios of principal distances by another unit or pixel pitch
 ROUND = 0.05  # relative tolerance of these ratios
 FLAT = 1e-3  # relative thickness of a flat field, which is mirrored by mirroring the stations
-FEWEST = 8  # points of an image that tell by a linear transformation what is wrong with it
-FEWEST_IMAGES = 3  # images needed for a median misfit
-WORSE, LARGE = 4.0, 0.01  # times the median misfit of the images, and misfit above which other numbers are tried
-BETTER, MUCH_BETTER = 3.0, 10.0  # ratio by which right numbers lower the misfit of an image worse than most, or alike
-MOST_OFF = 30  # largest shift of numbers tried
-QUARTERS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))  # cosine and sine
-FEWEST_FIDUCIALS = 4  # of a frame, that tell by an affine transformation which are exchanged
-# Scan orientations: turned by quarters, and mirrored; the unmirrored ones first.
-TURNS = [flip @ np.array([[c, -s], [s, c]]) for flip in (np.eye(2), np.diag([-1.0, 1.0])) for c, s in QUARTERS]
-MARGIN = 0.01  # fraction of the frame that a mark may lie outside: edge of the outermost pixel, rounded frame size
-NEARLY_ALL = 0.9  # fraction of marks outside the image above which the axes are wrong, not the marks
-FLAT_BOARD = 1e-2  # relief of given points over their extent below which they are flat
-AROUND = 0.25  # fraction of the extent of all marks by which an image of unknown size may extend beyond them
 UNITS = (1000.0, 100.0, 10.0, 0.3048, 25.4)  # ratios of length units: m, dm, cm, mm, feet, inches
 FACTORS = (*UNITS, *(1.0 / each for each in UNITS))
 MIRRORED = "the points are mirrored: the sign of X, Y or Z of all of them is wrong, or two axes are exchanged"
@@ -172,7 +143,7 @@ def network_hypotheses(network: Network, bare: Network, given: Adjustment | None
     # With any units of the axes linear transformations of the given points fit all images, but the adjustment does not.
     large_mm = LARGE * np.ptp(network.observations.xy_mm)
     misses = given is None or not given.converged or np.sqrt(np.mean(given.residuals.v_mm**2)) > large_mm
-    is_stretched = is_far and misses and all(each.misfit < LARGE for each in _transformed_fields(network))
+    is_stretched = is_far and misses and all(each.misfit < LARGE for each in transformed_fields(network))
     plane = _one_axis(network, (0, 1)) if is_stretched else ()
     yield from ([each] for each in chain(exchanged, heights, mirrored_images, _distances(network), plane))
 
@@ -223,7 +194,7 @@ def reversed_y(network: Network, keeps_given: bool = False) -> Network:
 
 def _mirrored_images(network: Network) -> Iterator[NetworkHypothesis]:
     """Hypothesis: those digital images are mirrored that a linear transformation of the given points shows so."""
-    fields = _transformed_fields(network)
+    fields = transformed_fields(network)
     names = [each.image.name for each in fields if each.handedness > 0.0 and each.image.transformation == "none"]
     if 0 < len(names) < len(network.images):
         who = f"image {names[0]} is" if len(names) == 1 else f"the images {shortened(names, NAMED)} are"
@@ -510,303 +481,3 @@ def _best_reading(
     alike = [words for words, each in trials.items() if np.linalg.norm(each) < CLEARLY / 2.0 * error]
     fits = CLEARLY * error < as_given and trials[best].max() < NEAR
     return " or ".join(alike) if fits else "", bool(is_observed or errors(given).max() > NEAR)
-
-
-def check_plausibility(result: Adjustment, trials: Trials) -> Adjustment:
-    """Add remarks on contradictions with the geometry of photographs to a result."""
-    if result.termination == "singular" or not result.network.observed_points:
-        return result
-    views = _views(result)
-    # The film transformations of an iteration that did not converge take marks anywhere.
-    outside = sorted(row for view in views if result.converged or view.digital for row in view.outside)
-    remarks, misread = list(_marks_outside(result, outside, trials)), tuple(_both_sides(result, trials))
-    if result.converged and not outside and not result.coordinate_blunders:
-        remarks += [each for view in views for each in _principal_point(view, result, trials.family)]
-    return replace(result, misread=misread, remarks=(*result.remarks, *remarks))
-
-
-class _CameraView(NamedTuple):
-    """Object points in the images of one camera.
-
-    digital: whether its images have no film transformation; xy_mm (n, 2): camera coordinates; picture (2, 2): image
-    area in mm, by two opposite corners, None where its size is unknown; outside: rows of the marks outside it.
-    """
-
-    camera: Camera
-    digital: bool
-    xy_mm: Array
-    picture: Array | None
-    outside: list[int]
-
-
-def _views(result: Adjustment) -> list[_CameraView]:
-    """Views of the cameras whose images show object points."""
-    in_camera_mm, images = observed_in_camera(result.run.problem, result.run.end.state), result.network.images
-    films, found = {image.camera for image in images if image.transformation != "none"}, list[_CameraView]()
-    for name, rows in result.run.problem.targets_by_camera.items():
-        if not len(rows):
-            continue
-        camera, digital, xy_mm = result.network.camera_by_name[name], name not in films, in_camera_mm[rows]
-        size = np.array(camera.frame_mm)
-        picture: Array | None = None
-        # Of unknown size, all marks of a digital camera are outside if they lie above and right of the first pixel.
-        outside = rows if digital and (xy_mm > 0.0).all() else rows[:0]
-        if size.all():
-            # The image area of a digital camera starts at the first pixel, like the comparator coordinates. That of a
-            # film camera is centred on the fiducial marks. It is centred on the origin where nearly all marks lie
-            # inside then, and more than otherwise.
-            marks = [[mark.x_mm.value, mark.y_mm.value] for mark in camera.fiducials.values()]
-            middle_mm = (np.min(marks, axis=0) + np.max(marks, axis=0)) / 2.0 if marks else np.zeros(2)
-            low = size * [0.0, -1.0] if digital else middle_mm - size / 2.0
-            picture, centred = np.array([low, low + size]), np.array([-size / 2.0, size / 2.0])
-            if _is_outside(centred, xy_mm).mean() < min(1.0 - NEARLY_ALL, _is_outside(picture, xy_mm).mean()):
-                picture = centred
-            outside = rows[_is_outside(picture, xy_mm)]
-        found.append(_CameraView(camera, digital, xy_mm, picture, outside.tolist()))
-    return found
-
-
-def _is_outside(picture: Array, xy_mm: Array) -> Mask:
-    """Mask of points (n, 2) outside an image area."""
-    margin = MARGIN * float(np.ptp(picture, axis=0).max())
-    return np.asarray(((xy_mm < picture[0] - margin) | (xy_mm > picture[1] + margin)).any(axis=1))
-
-
-def _marks_outside(result: Adjustment, rows: Sequence[int], trials: Trials) -> Iterator[str]:
-    if not rows:
-        return
-    network, observations = result.network, result.network.observations
-    count = int((~observations.is_fiducial).sum())
-    sized = [camera for camera in network.cameras if all(camera.frame_mm)]
-    where = f"(frame_mm = {list(sized[0].frame_mm)})" if sized else "above its first row of pixels"
-    words = f"{len(rows)} of {count} marks lie outside the picture{' ' if sized else ', '}{where}"
-    if len(rows) < NEARLY_ALL * count:
-        shown = shortened([f"{observations.image[row]}/{observations.point[row]}" for row in rows], NAMED)
-        yield f"{words}: {shown}. Their coordinates, frame_mm or the pitch is wrong. Correct it."
-        return
-    other = reversed_y(network, keeps_given=True)
-    is_digital = all(image.transformation == "none" for image in network.images)
-    turned = trials.adjust(other) if is_digital else None
-    if turned is None or any(view.outside for view in _views(turned)):
-        yield (
-            f"{words}: the comparator counts x to the right and y up, from the first pixel. Correct the coordinates, "
-            "frame_mm or the pitch."
-        )
-        return
-    fits = trials.explains(turned) or turned.sigma0 < 1.01 * result.sigma0
-    yield (
-        f"{words}. With y pointing up instead of down all lie inside (σ₀ = {turned.sigma0:.2f}; as it stands "
-        f"{result.sigma0:.2f}){'' if fits else ', but the observations agree less then'}: the y axis of the comparator "
-        "coordinates points down, or they count from the lower left corner. Give them with y up, from the first pixel."
-    )
-
-
-def _both_sides(result: Adjustment, trials: Trials) -> Iterator[str]:
-    """Report images whose stations lie on the other side of an opaque board than most."""
-    network, sides = result.network, _sides(result)
-    balance = sum(sides.values()) or -1.0  # equally many on both sides
-    fewer = [name for name, side in sides.items() if side * balance < 0.0]
-    if network.transparent or not fewer:
-        return
-    turned = trials.adjust(mirrored_images(network, fewer))
-    same = turned is not None and len(set(_sides(turned).values())) == 1
-    one, figures, even = len(fewer) == 1, "", ", or the others," if 2 * len(fewer) == len(sides) else ""
-    if turned is not None and same and turned.sigma0 < 1.05 * result.sigma0:
-        figures = (
-            f" With {'it' if one else 'them'} mirrored, all stations lie on one side and all observations agree as well"
-            f" (σ₀ = {turned.sigma0:.2f}; as it stands {result.sigma0:.2f})."
-        )
-    yield (
-        f"{'Image' if one else 'The images'} {shortened(fewer, NAMED)}{even}"
-        f" {'is' if one else 'are'} mirrored, or numbered as in a mirror, or the flat board is transparent: "
-        f"{'its station lies' if one else 'their stations lie'} on the other side of it than those of the "
-        f"{len(sides) - len(fewer)} other images, which an opaque board hides.{figures} Mirror "
-        f"{'the image' if one else 'the images'} and measure again, correct the point numbers, or write transparent = "
-        "true under [targets] or [object]."
-    )
-
-
-def _sides(result: Adjustment) -> dict[str, float]:
-    """Side (1 or -1) of the plane of the given points on which each station lies, by image; empty without a plane."""
-    network = result.network
-    places = [place for id_, place in network.known_places.items() if id_ in network.observed_points]
-    if len(places) < max(4, len(network.observed_points)):
-        return {}
-    xyz = np.array(places)
-    _, extents, axes = np.linalg.svd(xyz - xyz.mean(axis=0), full_matrices=False)
-    if extents[1] < FLAT_BOARD * extents[0] or extents[2] > FLAT_BOARD * extents[0]:
-        return {}
-    sides = np.sign((result.values[result.run.problem.exterior[:, :3]] - xyz.mean(axis=0)) @ axes[2]).tolist()
-    shown = {image.name: side for image, side in zip(network.images, sides, strict=True)}
-    return {name: side for name, side in shown.items() if name not in network.objectless_images}
-
-
-def _principal_point(view: _CameraView, result: Adjustment, family: float) -> Iterator[str]:
-    name, picture, kind = view.camera.name, view.picture, "outside the picture"
-    at = result.run.problem.unknowns.camera[name][1:3]
-    found = result.values[at]
-    words = f"The principal point of camera {name} is found at ({found[0]:.4g}, {found[1]:.4g}) mm"
-    if far := _far_from_given(view.camera, found, result, family):
-        yield f"{words}, {far}"
-        return
-    if picture is None:
-        low, high = (np.array([limit(values) for values in view.xy_mm.T]) for limit in (np.min, np.max))
-        reach = AROUND * (high - low).max()
-        picture = np.array([low - reach, high + reach])
-        if view.digital:
-            picture = np.array([np.minimum(picture[0], 0.0), np.maximum(picture[1], 0.0)])
-        kind = "outside all that the marks cover"
-    if _is_outside(picture, found[None])[0]:
-        (left, lower), (right, upper) = picture
-        yield (
-            f"{words}, {kind} (x from {left:g} to {right:g}, y from {lower:g} to {upper:g} mm), where no lens has it: "
-            "the images do not tell it from their tilts, or points are misnamed or misplaced. Give principal_point_mm "
-            "with its standard deviation (0 fixes it), or add images with other tilts; check the points' numbers and "
-            "coordinates."
-        )
-
-
-def _far_from_given(camera: Camera, found: Array, result: Adjustment, family: float) -> str:
-    """Describe a significant contradiction between estimated and given principal point; empty where there is none."""
-    priors = [prior for prior in (camera.x0_mm, camera.y0_mm) if prior is not None and 0.0 < prior.sigma < np.inf]
-    if len(priors) < len(found):
-        return ""
-    given, sigma = np.array([(prior.value, prior.sigma) for prior in priors]).T
-    cofactor = result.cofactor.part(result.run.problem.unknowns.camera[camera.name][1:3])
-    size, axes = np.linalg.eigh((np.diag(sigma**2) - cofactor) / np.outer(sigma, sigma))
-    along = axes.T @ ((found - given) / sigma)
-    checked = size > 1e-6
-    if not checked.any():
-        return ""
-    statistic = float((along[checked] ** 2 / size[checked]).sum()) / max(1.0, result.sigma0) ** 2
-    if statistic <= chdtri(int(checked.sum()), family):
-        return ""
-    off = found - given
-    turned = np.abs(off[0]) < abs(off[1]) and abs(found[1] + given[1]) < 0.1 * abs(off[1])
-    sign = " The sign of y looks wrong: y points up." if turned else ""
-    return (
-        f"({off[0]:+.3g}, {off[1]:+.3g}) mm from ({given[0]:g}, {given[1]:g}) ± ({sigma[0]:g}, {sigma[1]:g}), where it "
-        f"is given: {np.sqrt(statistic):.1f} times what its standard deviation allows.{sign} Check principal_point_mm, "
-        "from where it counts and its sign, or give it with a larger standard deviation."
-    )
-
-
-def misnumbered_images(network: Network) -> dict[str, str]:
-    """Find the frames whose point numbers are off, with the reasons; empty where all may be right."""
-    places, observations, fields = network.known_places, network.observations, _transformed_fields(network)
-    limit = WORSE * float(np.median([each.misfit for each in fields])) if fields else 0.0
-    doubted = [each for each in fields if each.misfit > min(limit, LARGE)]
-    if len(fields) < FEWEST_IMAGES or not doubted:
-        return {}
-    in_order = sorted(places, key=_natural)
-    place_of, xyz = {name: k for k, name in enumerate(in_order)}, np.array([places[name] for name in in_order])
-    orders, frames = list(_orders(xyz)), defaultdict[str, list[str]](list)
-    for each in doubted:
-        numbers = [place_of[observations.point[row]] for row in each.rows]
-        reordered = np.array([xyz[order[numbers]] for _, order in orders])
-        xy_mm = np.broadcast_to(observations.xy_mm[each.rows], (*reordered.shape[:2], 2))
-        misfits = linear_transformations(reordered, xy_mm).misfit
-        best = int(np.argmin(misfits))
-        if (BETTER if each.misfit > limit else MUCH_BETTER) * misfits[best] < each.misfit:
-            frames[orders[best][0]].append(each.image.frame)
-    return {
-        frame: f"the points of {shortened(some, NAMED)} are not numbered as they are given: {words}. Correct them."
-        for words, some in frames.items()
-        for frame in some
-    }
-
-
-def exchanged_fiducials(network: Network) -> dict[str, str]:
-    """Find the frames whose fiducials have each other's names, with the reasons; empty where all may be right.
-
-    An affine transformation of the given coordinates fits them far better under other names.
-    """
-    reasons = defaultdict[str, list[str]](list)
-    for number, image in enumerate(network.images):
-        marks = network.camera_by_name[image.camera].fiducials
-        rows = np.flatnonzero((network.image_numbers == number) & network.observations.has_kind("fiducial"))
-        names = [network.observations.point[row] for row in rows]
-        priors = [prior for name in names for prior in (marks[name].x_mm, marks[name].y_mm)]
-        if len(names) < FEWEST_FIDUCIALS or not all(np.isfinite(prior.sigma) for prior in priors):
-            continue
-        given_mm = np.array([prior.value for prior in priors]).reshape(-1, 2)
-        order = _other_names(given_mm, network.observations.xy_mm[rows])
-        renamed = {names[k]: names[other] for k, other in enumerate(order) if k != other}
-        if len(renamed) == 2:
-            reasons[f"{' and '.join(sorted(renamed))} are exchanged"].append(image.frame)
-        elif renamed:
-            reasons[", ".join(f"{name} is {other}" for name, other in renamed.items())].append(image.frame)
-    return {
-        frame: f"by the coordinates given, the fiducials of {shortened(some, NAMED)} have each other's names: {words}. "
-        "Correct the names, or the coordinates in the camera file."
-        for words, some in reasons.items()
-        for frame in some
-    }
-
-
-def _other_names(given_mm: Array, xy_mm: Array) -> list[int]:
-    """Index of the given mark (n, 2) that each observed one (n, 2) is, as few as possible exchanged."""
-    as_named, (given_mm, xy_mm) = list(range(len(xy_mm))), (each - each.mean(axis=0) for each in (given_mm, xy_mm))
-    misfit_mm = _affine_misfit(given_mm, xy_mm)
-    found = [(0, as_named)]
-    if misfit_mm > LARGE * np.ptp(xy_mm):
-        found += [
-            (int((order != as_named).sum()), order.tolist())
-            for turned in TURNS
-            for order in [linear_sum_assignment(cdist(xy_mm, given_mm @ turned.T))[1]]
-            if MUCH_BETTER * _affine_misfit(given_mm[order], xy_mm) < misfit_mm
-        ]
-    return min(found[1:] or found, key=lambda each: each[0])[1]
-
-
-def _affine_misfit(given_mm: Array, xy_mm: Array) -> float:
-    """Root mean square of what an affine transformation of centred places (n, 2) leaves of others."""
-    rest = xy_mm - given_mm @ np.linalg.lstsq(given_mm, xy_mm, rcond=None)[0]
-    return float(np.sqrt(np.mean(rest**2)))
-
-
-class _TransformedField(NamedTuple):
-    """Linear transformation of the given points (n,) of an image to their marks: see `linear_transformations`."""
-
-    image: Image
-    rows: Indices
-    misfit: float
-    handedness: float
-
-
-def _transformed_fields(network: Network) -> list[_TransformedField]:
-    """Transform the given points of every image that shows FEWEST of them, many images at once."""
-    names, number = network.observations.numbered_points
-    nowhere, found = np.full(3, np.nan), dict[int, _TransformedField]()
-    given = np.array([network.known_places.get(name, nowhere) for name in names]).reshape(-1, 3)[number]
-    rows = np.flatnonzero(~np.isnan(given[:, 0]) & ~network.observations.is_fiducial)
-    counts = np.bincount(network.image_numbers[rows], minlength=len(network.images))
-    of_images = np.split(rows[np.argsort(network.image_numbers[rows], kind="stable")], np.cumsum(counts)[:-1])
-    for size in np.unique(counts[counts >= FEWEST]):
-        images = np.flatnonzero(counts == size)
-        some = np.array([of_images[image] for image in images])
-        fits = linear_transformations(given[some], network.observations.xy_mm[some])
-        columns = [network.images[image] for image in images], some, fits.misfit.tolist(), fits.handedness.tolist()
-        found |= zip(images.tolist(), map(_TransformedField._make, zip(*columns, strict=True)), strict=True)
-    return [found[image] for image in sorted(found)]
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Sorting key by which p10 follows p9."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
-
-
-def _orders(xyz: Array) -> Iterator[tuple[str, Indices]]:
-    """Other orders of numbered points (p, 3): the point at each number, with words."""
-    count = len(xyz)
-    for off in range(1, min(MOST_OFF, count // 2) + 1):
-        for sign, how in ((1, "high"), (-1, "low")):
-            yield f"their numbers are {off} too {how}", (np.arange(count) - sign * off) % count
-    steps = np.linalg.norm(np.diff(xyz, axis=0), axis=1)
-    ends = np.flatnonzero(steps > 1.5 * np.median(steps)) + 1  # of the lines of a field that is numbered by lines
-    if len(ends) and len(set(np.diff([0, *ends, count]).tolist())) == 1:
-        lines = np.arange(count).reshape(len(ends) + 1, -1)
-        yield "these are numbered by columns, not by rows, or the reverse", lines.T.ravel()
-        turned = lines.copy()
-        turned[1::2] = lines[1::2, ::-1]
-        yield "these are numbered to and fro, or only here not", turned.ravel()

@@ -1,0 +1,152 @@
+"""Wrong names of points and fiducials, shown by each image alone before the network is adjusted.
+
+The projective transformation of the given points to an image tells wrong numbers without a camera: with right ones it
+fits but for the distortion, which all images share. Images that it fits worse by far are tried with other numbers. An
+affine transformation of the given fiducials to a frame shows which of them have each other's names.
+"""
+
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
+
+from adjust.array_types import Array, Indices
+from adjust.initial_values.dlt import linear_transformations
+from adjust.problem.network import Image, Network
+from adjust.problem.parameter import shortened
+
+NAMED = 5  # images named in a message
+FEWEST = 8  # points of an image that tell by a linear transformation what is wrong with it
+FEWEST_IMAGES = 3  # images needed for a median misfit
+WORSE, LARGE = 4.0, 0.01  # times the median misfit of the images, and misfit above which other numbers are tried
+BETTER, MUCH_BETTER = 3.0, 10.0  # ratio by which right numbers lower the misfit of an image worse than most, or alike
+MOST_OFF = 30  # largest shift of numbers tried
+QUARTERS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))  # cosine and sine
+FEWEST_FIDUCIALS = 4  # of a frame, that tell by an affine transformation which are exchanged
+# Scan orientations: turned by quarters, and mirrored; the unmirrored ones first.
+TURNS = [flip @ np.array([[c, -s], [s, c]]) for flip in (np.eye(2), np.diag([-1.0, 1.0])) for c, s in QUARTERS]
+
+
+def misnumbered_images(network: Network) -> dict[str, str]:
+    """Find the frames whose point numbers are off, with the reasons; empty where all may be right."""
+    places, observations, fields = network.known_places, network.observations, transformed_fields(network)
+    limit = WORSE * float(np.median([each.misfit for each in fields])) if fields else 0.0
+    doubted = [each for each in fields if each.misfit > min(limit, LARGE)]
+    if len(fields) < FEWEST_IMAGES or not doubted:
+        return {}
+    in_order = sorted(places, key=_natural)
+    place_of, xyz = {name: k for k, name in enumerate(in_order)}, np.array([places[name] for name in in_order])
+    orders, frames = list(_orders(xyz)), defaultdict[str, list[str]](list)
+    for each in doubted:
+        numbers = [place_of[observations.point[row]] for row in each.rows]
+        reordered = np.array([xyz[order[numbers]] for _, order in orders])
+        xy_mm = np.broadcast_to(observations.xy_mm[each.rows], (*reordered.shape[:2], 2))
+        misfits = linear_transformations(reordered, xy_mm).misfit
+        best = int(np.argmin(misfits))
+        if (BETTER if each.misfit > limit else MUCH_BETTER) * misfits[best] < each.misfit:
+            frames[orders[best][0]].append(each.image.frame)
+    return {
+        frame: f"the points of {shortened(some, NAMED)} are not numbered as they are given: {words}. Correct them."
+        for words, some in frames.items()
+        for frame in some
+    }
+
+
+def exchanged_fiducials(network: Network) -> dict[str, str]:
+    """Find the frames whose fiducials have each other's names, with the reasons; empty where all may be right.
+
+    An affine transformation of the given coordinates fits them far better under other names.
+    """
+    reasons = defaultdict[str, list[str]](list)
+    for number, image in enumerate(network.images):
+        marks = network.camera_by_name[image.camera].fiducials
+        rows = np.flatnonzero((network.image_numbers == number) & network.observations.has_kind("fiducial"))
+        names = [network.observations.point[row] for row in rows]
+        priors = [prior for name in names for prior in (marks[name].x_mm, marks[name].y_mm)]
+        if len(names) < FEWEST_FIDUCIALS or not all(np.isfinite(prior.sigma) for prior in priors):
+            continue
+        given_mm = np.array([prior.value for prior in priors]).reshape(-1, 2)
+        order = _other_names(given_mm, network.observations.xy_mm[rows])
+        renamed = {names[k]: names[other] for k, other in enumerate(order) if k != other}
+        if len(renamed) == 2:
+            reasons[f"{' and '.join(sorted(renamed))} are exchanged"].append(image.frame)
+        elif renamed:
+            reasons[", ".join(f"{name} is {other}" for name, other in renamed.items())].append(image.frame)
+    return {
+        frame: f"by the coordinates given, the fiducials of {shortened(some, NAMED)} have each other's names: {words}. "
+        "Correct the names, or the coordinates in the camera file."
+        for words, some in reasons.items()
+        for frame in some
+    }
+
+
+def _other_names(given_mm: Array, xy_mm: Array) -> list[int]:
+    """Index of the given mark (n, 2) that each observed one (n, 2) is, as few as possible exchanged."""
+    as_named, (given_mm, xy_mm) = list(range(len(xy_mm))), (each - each.mean(axis=0) for each in (given_mm, xy_mm))
+    misfit_mm = _affine_misfit(given_mm, xy_mm)
+    found = [(0, as_named)]
+    if misfit_mm > LARGE * np.ptp(xy_mm):
+        found += [
+            (int((order != as_named).sum()), order.tolist())
+            for turned in TURNS
+            for order in [linear_sum_assignment(cdist(xy_mm, given_mm @ turned.T))[1]]
+            if MUCH_BETTER * _affine_misfit(given_mm[order], xy_mm) < misfit_mm
+        ]
+    return min(found[1:] or found, key=lambda each: each[0])[1]
+
+
+def _affine_misfit(given_mm: Array, xy_mm: Array) -> float:
+    """Root mean square of what an affine transformation of centred places (n, 2) leaves of others."""
+    rest = xy_mm - given_mm @ np.linalg.lstsq(given_mm, xy_mm, rcond=None)[0]
+    return float(np.sqrt(np.mean(rest**2)))
+
+
+class TransformedField(NamedTuple):
+    """Linear transformation of the given points (n,) of an image to their marks: see `linear_transformations`."""
+
+    image: Image
+    rows: Indices
+    misfit: float
+    handedness: float
+
+
+def transformed_fields(network: Network) -> list[TransformedField]:
+    """Transform the given points of every image that shows FEWEST of them, many images at once."""
+    names, number = network.observations.numbered_points
+    nowhere, found = np.full(3, np.nan), dict[int, TransformedField]()
+    given = np.array([network.known_places.get(name, nowhere) for name in names]).reshape(-1, 3)[number]
+    rows = np.flatnonzero(~np.isnan(given[:, 0]) & ~network.observations.is_fiducial)
+    counts = np.bincount(network.image_numbers[rows], minlength=len(network.images))
+    of_images = np.split(rows[np.argsort(network.image_numbers[rows], kind="stable")], np.cumsum(counts)[:-1])
+    for size in np.unique(counts[counts >= FEWEST]):
+        images = np.flatnonzero(counts == size)
+        some = np.array([of_images[image] for image in images])
+        fits = linear_transformations(given[some], network.observations.xy_mm[some])
+        columns = [network.images[image] for image in images], some, fits.misfit.tolist(), fits.handedness.tolist()
+        found |= zip(images.tolist(), map(TransformedField._make, zip(*columns, strict=True)), strict=True)
+    return [found[image] for image in sorted(found)]
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sorting key by which p10 follows p9."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def _orders(xyz: Array) -> Iterator[tuple[str, Indices]]:
+    """Other orders of numbered points (p, 3): the point at each number, with words."""
+    count = len(xyz)
+    for off in range(1, min(MOST_OFF, count // 2) + 1):
+        for sign, how in ((1, "high"), (-1, "low")):
+            yield f"their numbers are {off} too {how}", (np.arange(count) - sign * off) % count
+    steps = np.linalg.norm(np.diff(xyz, axis=0), axis=1)
+    ends = np.flatnonzero(steps > 1.5 * np.median(steps)) + 1  # of the lines of a field that is numbered by lines
+    if len(ends) and len(set(np.diff([0, *ends, count]).tolist())) == 1:
+        lines = np.arange(count).reshape(len(ends) + 1, -1)
+        yield "these are numbered by columns, not by rows, or the reverse", lines.T.ravel()
+        turned = lines.copy()
+        turned[1::2] = lines[1::2, ::-1]
+        yield "these are numbered to and fro, or only here not", turned.ravel()
