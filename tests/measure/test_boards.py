@@ -592,6 +592,20 @@ def test_markers_on_a_board_of_another_count_name_it(columns: int, rows: int, wo
     assert f"but as with {words}. Set that" in read.reason
 
 
+def test_one_marker_more_is_no_board_of_another_count() -> None:
+    """It may be a false reading, which agrees with one of many counts."""
+    dictionary = specs.aruco_dictionary("4X4_50")
+    picture = cv2.aruco.GridBoard((4, 3), 20.0, 8.0, dictionary, np.arange(5, 17))
+    drawing = np.full((344, 344), 255, np.uint8)
+    drawing[:264] = picture.generateImage((344, 264), marginSize=20)
+    further = cv2.aruco.GridBoard((4, 4), 20.0, 8.0, dictionary, np.arange(5, 21)).generateImage(
+        (344, 344), marginSize=20
+    )
+    drawing[264:, :100] = further[264:, :100]
+    read = find_aruco(drawing, specs.ArucoSpec("4X4_50", 4, 3, 20.0, 8.0, first_marker=5))
+    assert len(read.corners) == 48
+
+
 def test_charuco_rows_too_few_are_named() -> None:
     spec = specs.CharucoSpec("4X4_50", 6, 7, 32.0, 24.0)
     assert "but as with rows = 7" in find_charuco(generated(spec), replace(spec, rows=5)).reason
