@@ -188,8 +188,8 @@ def fit_corners(
     read: Callable[[int, int, int], ScanWindow],
     starts: Sequence[CornerStart],
     surface: Surface,
-    rounding_step_dn: float = 0.0,
-    first_block_px: tuple[int, int] = (0, 0),
+    rounding_step_dn: float,
+    first_block_px: tuple[int, int],
 ) -> list[Corner]:
     """Fit all corners of a board at once. read: returns the square window with the given first column, first row and
     side, px; surface: `crossing` or `quarter`; rounding_step_dn, first_block_px: of the scan."""
@@ -267,10 +267,14 @@ class _CornerFits:
         self._linearise(np.arange(len(self.windows)), is_first=True)
         for stage, tolerance_px in enumerate(_STAGES_TOLERANCE_PX):
             moving = np.array([number for number, reason in enumerate(self.reasons) if not reason], np.intp)
-            if stage == 1:
-                self._bend_edges()
+            if stage == 1:  # take the curvature of the edges from the corners as they are fitted so far
+                fits = np.array([not reason for reason in self.reasons])
+                centers_px = np.where(fits[:, None], self.center + self.origin, np.nan)
+                self.curvatures = edge_curvatures(centers_px, self.board, self._normals(np.arange(len(fits))))
             if stage:
-                scale[moving] = self._residual_scales(moving)
+                floor = _SCALE_FLOOR * 2 * np.abs(self.linear[moving, 0])
+                robust = [robust_scale(self.residuals[number, self.weights[number] > 0]) for number in moving]
+                scale[moving] = np.maximum(np.maximum(robust, floor), 1e-9)
             for _ in range(_MAX_ITERATIONS):
                 if not len(moving):
                     break
@@ -279,12 +283,6 @@ class _CornerFits:
                 moving = moving[(lengths_px >= tolerance_px) & [not self.reasons[number] for number in moving]]
             self._refuse(moving, UNSETTLED)
         return self._corners()
-
-    def _bend_edges(self) -> None:
-        """Take the curvature of the edges from the corners as they are fitted so far."""
-        fits = np.array([not reason for reason in self.reasons])
-        centers_px = np.where(fits[:, None], self.center + self.origin, np.nan)
-        self.curvatures = edge_curvatures(centers_px, self.board, self._normals(np.arange(len(fits))))
 
     def _refuse(self, numbers: Indices, reason: Reason) -> None:
         for number in numbers:
@@ -363,12 +361,6 @@ class _CornerFits:
         along = self.along_from_pixel[numbers].astype(np.float32) @ offset
         inside = (self.reach[numbers] + 0.5).astype(np.float32)[..., None] - np.abs(along, out=along)
         return np.asarray(self.valid[numbers] * np.clip(inside, 0.0, 1.0, out=inside).prod(axis=1))
-
-    def _residual_scales(self, numbers: Indices) -> Array:
-        """(m,) residual scales for Tukey's weights."""
-        floor = _SCALE_FLOOR * 2 * np.abs(self.linear[numbers, 0])
-        robust = [robust_scale(self.residuals[number, self.weights[number] > 0]) for number in numbers]
-        return np.asarray(np.maximum(np.maximum(robust, floor), 1e-9))
 
     def _normals(self, numbers: Indices) -> Array:
         """(m, 2 edges, 2) unit normals of the edges."""

@@ -121,7 +121,7 @@ def _grown(picture: Bytes, grid: Array, contrast: float) -> tuple[Array, bool]:
 def _crossing_contrast(picture: Bytes, grid: Array) -> Array:
     """(rows, columns) smallest difference in grey value between neighbours of the four squares around each corner, with
     the sign relative to the first corner's parity; 0 where light and dark do not alternate."""
-    right, down = np.gradient(grid, axis=1), np.gradient(grid, axis=0)
+    right, down = np.moveaxis(_grid_steps(grid), -1, 0)
     corners = [grid + _INTO_SQUARE * (x * right + y * down) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     columns_rows = np.concatenate(corners).astype(np.float32)
     columns, rows = columns_rows[..., 0], columns_rows[..., 1]
@@ -146,10 +146,16 @@ def _refined(picture: Bytes, grid: Array) -> Array:
     return refined
 
 
+def _grid_steps(grid: Array) -> Array:
+    """(rows, columns, 2, 2) steps from each place of a grid (rows, columns, 2); the columns of a matrix are those to
+    the next column and the next row."""
+    return np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=-1)
+
+
 def _shorter_steps(grid: Array) -> Array:
     """(rows, columns) shorter one of the steps to the next column and the next row, px."""
-    across, down = (np.hypot(*np.moveaxis(np.gradient(grid, axis=axis), 2, 0)) for axis in (1, 0))
-    return np.asarray(np.maximum(np.minimum(across, down), 1e-9))  # a detector may give a corner twice
+    lengths = np.linalg.norm(_grid_steps(grid), axis=2)
+    return np.asarray(np.maximum(lengths.min(axis=-1), 1e-9))  # a detector may give a corner twice
 
 
 def find_chessboard(picture: Bytes, spec: ChessboardSpec, is_quick: bool = False) -> FoundBoard:
@@ -165,7 +171,7 @@ def find_chessboard(picture: Bytes, spec: ChessboardSpec, is_quick: bool = False
         if pattern is None:
             continue
         if pattern.grid.shape == grid.shape == (spec.rows, spec.columns, 2):
-            steps = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=-1)
+            steps = _grid_steps(grid)
             places = np.ndindex(*grid.shape[:2])
             corners = {f"r{row}c{column}": FoundCorner(grid[row, column], steps[row, column]) for row, column in places}
             return FoundBoard(corners)
@@ -197,8 +203,7 @@ def _part_of_chessboard(picture: Bytes, pattern: WholePattern, spec: ChessboardS
     shown = inside & (contrasts > _CROSSING * np.median(contrasts[inside]))
     # The sides of a square along the board's rows and columns, whatever the orientation of the grid.
     board = np.stack([naming % spec.columns, naming // spec.columns], axis=-1).astype(float)
-    by_grid = np.stack([np.gradient(board, axis=1)[0, 0], np.gradient(board, axis=0)[0, 0]], axis=-1)
-    steps = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=-1) @ np.linalg.inv(by_grid)
+    steps = _grid_steps(grid) @ np.linalg.inv(_grid_steps(board)[0, 0])
     corners = {
         f"r{naming[place] // spec.columns}c{naming[place] % spec.columns}": FoundCorner(grid[place], steps[place])
         for place in np.ndindex(naming.shape[0], naming.shape[1])
@@ -344,7 +349,7 @@ def _other_chessboards(scan: Scan, found: FoundBoard, spec: ChessboardSpec, fact
             return tuple(others)
         others.append(grid.mean(axis=(0, 1)) * factor + offset)
         centers = grid.reshape(-1, 2)
-        steps = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=-1).reshape(-1, 2, 2)
+        steps = _grid_steps(grid).reshape(-1, 2, 2)
 
 
 def _right_handed(grid: Array) -> Array:

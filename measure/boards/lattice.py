@@ -7,6 +7,7 @@ from itertools import product
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from measure.array_types import Array, Bytes, Integers
@@ -263,7 +264,15 @@ def find_squares(picture: Bytes, spec: SquareGridSpec) -> FoundBoard:
         if grid.is_larger:  # other thresholds may lose its lines
             break
         if not reason:
-            corners = _square_corners(quads, centers, grid.assignment, spec)
+            grid_places_px = centers[list(grid.assignment.values())]
+            columns_rows = np.array([(column, row) for row, column in grid.assignment], float)
+            homography = np.asarray(cv2.findHomography(columns_rows, grid_places_px)[0], float)
+            corners: dict[str, FoundCorner] = {}
+            for (row, column), index in grid.assignment.items():
+                quad, steps = quads[index], homography_steps(homography, np.array([column, row], float))[1]
+                right, down = np.linalg.solve(steps, (quad - quad.mean(axis=0)).T)
+                clockwise = np.argsort(np.arctan2(down, right))  # from the upper left one
+                corners |= corners_of_square(f"r{row}c{column}", quad[clockwise])
             return FoundBoard(corners, others_px=grid.others_px, notes=grid.notes)
     return FoundBoard({}, reason)
 
@@ -283,21 +292,9 @@ def _dark_quads(picture: Bytes, share: float) -> Iterator[Array]:
             yield np.asarray(quad, float).reshape(4, 2)
 
 
-def _square_corners(
-    quads: list[Array], centers: Array, assignment: dict[Place, int], spec: SquareGridSpec
-) -> dict[str, FoundCorner]:
-    """Corners of a grid's squares, clockwise from the upper left one in the orientation of the specification."""
-    grid = np.array([(column, row) for row, column in assignment], float)
-    homography = np.asarray(cv2.findHomography(grid, centers[list(assignment.values())])[0], float)
-    corners: dict[str, FoundCorner] = {}
-    for (row, column), index in assignment.items():
-        steps = homography_steps(homography, np.array([column, row], float))
-        right, down = np.linalg.solve(steps, (quads[index] - quads[index].mean(axis=0)).T)
-        corners |= corners_of_square(spec.square_name((row, column)), quads[index][np.argsort(np.arctan2(down, right))])
-    return corners
-
-
-def homography_steps(homography: Array, place: Array) -> Array:
-    """(2, 2) derivatives of a homography at a place, the steps to the next column and row."""
-    x, y, w = homography @ (*place, 1.0)
-    return np.asarray((homography[:2, :2] - np.outer((x, y), homography[2, :2]) / w) / w)
+def homography_steps(homography: Array, place: ArrayLike) -> tuple[Array, Array]:
+    """Image (2,) of a place (2,) under a homography, and its derivatives (2, 2): the steps to the next column and
+    row."""
+    x, y, w = homography @ np.append(place, 1.0)
+    image = np.array([x, y]) / w
+    return image, np.asarray((homography[:2, :2] - np.outer(image, homography[2, :2])) / w)

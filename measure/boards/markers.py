@@ -248,7 +248,7 @@ def find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
         return FoundBoard({}, Reason(message, Code.NO_BOARD), read.refused)
     homography = np.asarray(cv2.findHomography(board, places)[0], float)
     found = {
-        f"c{number}": FoundCorner(place, homography_steps(homography, on_board))
+        f"c{number}": FoundCorner(place, homography_steps(homography, on_board)[1])
         for number, place, on_board in zip(ids, places, board, strict=True)
     }
     off = off_corners(found, spec, read)
@@ -393,8 +393,8 @@ def off_corners(found: Mapping[str, FoundCorner], spec: CharucoSpec, read: ReadM
         squares = np.concatenate([on_board[number] for number in touching]) / spec.square_mm
         image_px = np.concatenate([read.corners_px[number] for number in touching])
         homography = np.asarray(cv2.findHomography(squares, image_px)[0], float)
-        x, y, w = homography @ (*place, 1.0)
-        squares_off = np.linalg.solve(homography_steps(homography, place), corner.center_px - (x / w, y / w))
+        place_px, steps_px = homography_steps(homography, place)
+        squares_off = np.linalg.solve(steps_px, corner.center_px - place_px)
         if np.hypot(*squares_off) > _OFF_SQUARES:
             message = f"it lies {np.hypot(*squares_off):.1f} squares from the place that the adjacent markers give"
             off[name] = Reason(message, Code.OFF_PLACE)

@@ -1,6 +1,6 @@
 """Measure the points of a calibration board in a scan: corners by least-squares matching, dots as disks."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -9,9 +9,8 @@ from scipy.spatial import KDTree
 
 from measure.array_types import Array
 from measure.boards.corner_fit import Corner, CornerStart, Surface, crossing, fit_corners, quarter
-from measure.boards.edge_shift import without_edge_shift
 from measure.boards.find import find_board
-from measure.boards.lattice import Place, find_grid, grid_size
+from measure.boards.lattice import Place, find_grid, grid_size, homography_steps
 from measure.boards.specs import (
     AprilGridSpec,
     ArucoSpec,
@@ -20,15 +19,19 @@ from measure.boards.specs import (
     ChessboardSpec,
     CircleGridSpec,
     FoundCorner,
+    Point3,
     SquareGridSpec,
 )
-from measure.flags import NO_REASON, Code, Reason, Status
+from measure.flags import NO_REASON, Cause, Code, Reason, Status
+from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.matching.window import ScanWindow, clipped_sides
+from measure.noise.robust_estimation import robust_scale
 from measure.results import Covariance, MarkMeasurement
 from measure.scans.scan import Scan
 from measure.targets.block_search import Patches, TargetCandidate
 from measure.targets.detection import DiskSearch, disk_candidates
 from measure.targets.disks import FittedDisk, fit_plain_disks
+from measure.targets.sheets import fit_view_robustly
 
 _MIRROR = np.array([-1.0, 1.0])  # of column and row
 _SMALLEST_DOT_PX = 5.0  # px, diameter
@@ -41,6 +44,9 @@ _LONGEST_REACH_PX = 10.0  # px, enough for 0.01 px...
 _LARGE_REACH, _LARGEST_REACH_PX = 0.1, 15.0  # ...but squares this large may be blurred by several pixels
 _HALF_SIDE, _FREE_GAP = 0.5, 0.8  # fractions of an isolated square's side, and of the gap around it
 _MARKER_REACH = 0.8  # fraction of a marker's black border, or of the gap around it
+_SHIFT_PRIOR = 0.3  # standard deviation of the shift of edges, in blurs: a gamma of 2.2 shifts by 0.4 to the light
+_FEWEST_SHIFTED = 16  # corners, of four squares: those of fewer are as well explained by another view
+_SHIFT_ROUNDS = 4  # views and shifts in turn; a view takes up less than a fifth of a shift
 _NEIGHBOURS = 4  # nearest crossings along the rows and columns
 _FEWEST_CROSSINGS = 30  # needed to distinguish coma from noise
 _WEAK_DAMAGE = 0.25  # fraction of the pixels around a corner: if more are rejected the corner is weak
@@ -71,7 +77,8 @@ class BoardMeasurement:
 
 def _measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> BoardMeasurement:
     """Measure the dots of a grid. Undetected dots are fitted at the places predicted from the others."""
-    patches = disk_candidates(scan, DiskSearch((_SMALLEST_DOT_PX, _largest_dot_px(scan, spec))))
+    diameter_px = spec.diameter_mm / spec.spacing_mm * max(scan.width_px, scan.height_px) / min(spec.columns, spec.rows)
+    patches = disk_candidates(scan, DiskSearch((_SMALLEST_DOT_PX, max(2 * _SMALLEST_DOT_PX, diameter_px))))
     centers = np.array([patch.center_px for patch in patches]).reshape(-1, 2)
     grid, is_mirrored = find_grid(centers, _appearances(patches), spec, "dots"), False
     if grid.reason and spec.asymmetric:  # with even columns and rows it differs from its mirror image
@@ -102,13 +109,6 @@ def _appearances(patches: list[TargetCandidate]) -> Array:
     )
 
 
-def _largest_dot_px(scan: Scan, spec: CircleGridSpec) -> float:
-    """Largest possible diameter of a dot, if the grid fills the scan."""
-    places = min(spec.columns, spec.rows)
-    share = spec.diameter_mm / spec.spacing_mm
-    return max(2 * _SMALLEST_DOT_PX, share * max(scan.width_px, scan.height_px) / places)
-
-
 def _predicted(place: Place, detected: Mapping[Place, TargetCandidate]) -> TargetCandidate:
     """Predict a dot by a homography of its nearest neighbours, with their mean shape and contrast."""
     others = sorted(detected, key=lambda other: np.hypot(other[0] - place[0], other[1] - place[1]))
@@ -116,10 +116,10 @@ def _predicted(place: Place, detected: Mapping[Place, TargetCandidate]) -> Targe
     homography, _ = cv2.findHomography(
         np.array(nearest, float), np.array([detected[each].center_px for each in nearest])
     )
-    x, y, w = np.asarray(homography, float) @ (*place, 1.0)
+    center_px, _ = homography_steps(np.asarray(homography, float), place)
     alike = Patches.collect([detected[each] for each in nearest[:_NEAREST_DOTS]])
     shape = np.linalg.cholesky((alike.shapes @ alike.shapes.swapaxes(1, 2)).mean(axis=0))
-    return TargetCandidate(np.array([x / w, y / w]), shape, float(alike.contrasts.mean()))
+    return TargetCandidate(center_px, shape, float(alike.contrasts.mean()))
 
 
 def _is_whole(scan: Scan, disk: TargetCandidate | FittedDisk) -> bool:
@@ -194,8 +194,12 @@ def _unless_alone(scan: Scan, measured: BoardMeasurement, kind: str, others_px: 
 
 def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) -> dict[str, Corner]:
     """Fit the detected corners by least-squares matching."""
-    board_reach_px = _common_reach_px(found.values()) if found else 0.0
-    points, starts = spec.object_points(), list[CornerStart]()
+    points, starts, board_reach_px = spec.object_points(), list[CornerStart](), 0.0
+    if found:
+        # The effect of a camera's sharpening depends on the window: equal ones make it the same for all corners.
+        side_px = float(np.median([np.hypot(*corner.steps_px).min() for corner in found.values()]))
+        longest_px = np.clip(_LARGE_REACH * side_px, _LONGEST_REACH_PX, _LARGEST_REACH_PX)
+        board_reach_px = float(np.clip(_REACH * side_px, _SHORTEST_REACH_PX, longest_px))
     for name, each in found.items():
         reach_px = _reach_px(np.hypot(*each.steps_px), spec, board_reach_px)
         starts.append(CornerStart(each.center_px, each.steps_px, reach_px, np.array(points[name][:2])))
@@ -213,7 +217,52 @@ def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) ->
     fitted = dict(zip(found, corners, strict=True))
     if not stands_alone:
         return fitted
-    return without_edge_shift(fitted, found, points, (scan.width_px, scan.height_px))
+    return _correct_edge_shift(fitted, found, points, (scan.width_px, scan.height_px))
+
+
+# Shift of the edges of separate markers and squares by the tone curve and by ink, estimated from the board's geometry.
+#
+# Edges are matched in stored grey values. Under a tone curve, such as the gamma of most cameras, the middle grey value
+# of a blurred edge is not the middle of its light, so that all edges shift towards the same side by the same share of
+# their blur. A crossing stays, since its edges shift symmetrically; the corners of a separate square move along its
+# diagonals. Ink that has spread does the same. The distances between squares do not change, and show it.
+
+
+def _correct_edge_shift(
+    fitted: Mapping[str, Corner],
+    found: Mapping[str, FoundCorner],
+    points: Mapping[str, Point3],
+    size_px: tuple[int, int],
+) -> dict[str, Corner]:
+    """Move the corners of separate squares back by the shift of their edges, and add its uncertainty to them. fitted,
+    found: corners by id, and the sides of their squares; points: object points by id; size_px: of the scan."""
+    names = [name for name, corner in fitted.items() if not corner.reason]
+    if not names:
+        return dict(fitted)
+    blurs_px = [np.sqrt(fitted[name].blur_px ** 2 + PIXEL_VARIANCE_PX2) for name in names]
+    moves_px = np.array([blur * _outward(found[name].steps_px) for blur, name in zip(blurs_px, names, strict=True)])
+    places_px = np.array([fitted[name].center_px for name in names])
+    board = np.array([points[name][:2] for name in names])
+    shift, variance = 0.0, _SHIFT_PRIOR**2
+    for _ in range(_SHIFT_ROUNDS if len(names) >= _FEWEST_SHIFTED else 0):
+        view = fit_view_robustly(board, places_px - shift * moves_px, size_px)
+        if view is None:
+            break
+        off_px = np.nan_to_num(places_px - view.places_px(board))
+        noise_px2 = robust_scale((off_px - shift * moves_px).ravel()) ** 2 + 1e-9
+        variance = 1 / (1 / _SHIFT_PRIOR**2 + (moves_px**2).sum() / noise_px2)
+        shift = variance * float((moves_px * off_px).sum()) / noise_px2
+    moved = dict(fitted)
+    for name, move_px in zip(names, moves_px, strict=True):
+        covariance = fitted[name].covariance.plus(Cause.TONE, variance * np.outer(move_px, move_px))
+        moved[name] = replace(fitted[name], center_px=fitted[name].center_px - shift * move_px, covariance=covariance)
+    return moved
+
+
+def _outward(sides_px: Array) -> Array:
+    """(2,) how a corner with the given sides (columns) moves where its edges move outwards by 1."""
+    along = sides_px / np.hypot(*sides_px)
+    return np.asarray(-along.sum(axis=1) / max(abs(float(np.linalg.det(along))), 1e-3))
 
 
 def _reach_px(sides_px: Array, spec: BoardSpec, board_reach_px: float) -> Array:
@@ -228,15 +277,6 @@ def _reach_px(sides_px: Array, spec: BoardSpec, board_reach_px: float) -> Array:
     if isinstance(spec, CharucoSpec):  # exclude the marker in one of the squares
         farthest = (spec.square_mm - spec.marker_mm) / (2 * spec.square_mm)
     return np.full(2, min(board_reach_px, farthest * float(sides_px.min())))
-
-
-def _common_reach_px(corners: Iterable[FoundCorner]) -> float:
-    """One reach (px) for a whole board. The effect of a camera's sharpening depends on the window, so equal windows
-    make it the same for near and far corners."""
-    sides = [float(np.hypot(*corner.steps_px).min()) for corner in corners]
-    side_px = float(np.median(sides))
-    longest_px = np.clip(_LARGE_REACH * side_px, _LONGEST_REACH_PX, _LARGEST_REACH_PX)
-    return float(np.clip(_REACH * side_px, _SHORTEST_REACH_PX, longest_px))
 
 
 def _named_by_colour(

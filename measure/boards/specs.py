@@ -160,15 +160,10 @@ class SquareGridSpec(_Spec):
         """(row, column) of every square."""
         return list(product(range(self.rows), range(self.columns)))
 
-    @staticmethod
-    def square_name(place: tuple[int, int]) -> str:
-        """Name of the square at (row, column)."""
-        return f"r{place[0]}c{place[1]}"
-
     def object_points(self) -> dict[str, Point3]:
         """Id to (X, Y, 0) in mm."""
         corners = _corners(self.columns, self.rows, self.square_mm, self.gap_mm)
-        return {f"{self.square_name((row, column))}.{corner}": at for (row, column, corner), at in corners.items()}
+        return {f"r{row}c{column}.{corner}": at for (row, column, corner), at in corners.items()}
 
 
 @dataclass(frozen=True)

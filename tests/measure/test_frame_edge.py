@@ -361,7 +361,7 @@ def fit_mark(window: Array, start: Array, steps: Array, alone: bool, rounding_st
         return ScanWindow(grey[part], (col, row), valid[part])
 
     starts = [CornerStart(start, steps, np.array([6.0, 6.0]), np.zeros(2))]
-    return fit_corners(read, starts, quarter if alone else crossing, rounding_step_dn)[0]
+    return fit_corners(read, starts, quarter if alone else crossing, rounding_step_dn, (0, 0))[0]
 
 
 @parametrize_with_studies(("blur_px", "alone"), [(0.5, False), (0.9, False), (1.5, False), (0.8, True)], quick=(1,))
