@@ -8,14 +8,16 @@ give the principal distance and all poses without a search where there are no gr
 Arrays (m, n) hold n points of m images; `present` marks those that an image shows.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from adjust.array_types import Array, Mask
+from adjust.array_types import Array, Indices, Mask
 
 FLAT_FIELD = 0.05  # relative thickness of a field below which a linear transformation does not tell its depth
 CLEAR = 5.0  # 1 / c² in its standard deviations, from which on it is determined
+SINGULAR = 1e-14  # fraction of the trace that keeps equations regular
 LEAST_DEPTH = 1e-12  # of points in a field of size 1: nearer ones are imaged as far off as that
 
 
@@ -94,6 +96,33 @@ def linear_transformations(xyz: Array, xy_mm: Array, present: Mask | None = None
         coefficients[own] = np.concatenate([found[..., :-1] @ np.swapaxes(axes, -1, -2), found[..., -1:]], axis=2)
     coefficients *= np.where(coefficients[:, 2:, 3:] < 0.0, -1.0, 1.0)  # the depth of the centroid
     return LinearTransformations(field, image, present, is_flat, coefficients)
+
+
+def equations_by_point(xyz: Array, xy_mm: Array, present: Mask) -> Callable[[Indices], Array]:
+    """Linear equations of images (m, n, 2) as a function of the points (n,), of some (p, 3), that they show.
+
+    These are (m, n, 2, 3 w), 0 where absent; their coefficients (3, w) are those of the transformation.
+    """
+    field, image = _Normalised.of(xyz[None], np.ones((1, len(xyz)), dtype=bool)), _Normalised.of(xy_mm, present)
+    is_flat = field.extents[0, -1] < FLAT_FIELD * field.extents[0, 0]
+    at = np.hstack([field.places[0] @ (field.axes[0, :, :2] if is_flat else np.eye(3)), np.ones((len(xyz), 1))])
+
+    def equations(shown: Indices) -> Array:
+        by = at[shown] * present[..., None]
+        rows = [[by, 0.0 * by, -image.places[..., :1] * by], [0.0 * by, by, -image.places[..., 1:] * by]]
+        return np.stack([np.concatenate(row, axis=2) for row in rows], axis=2)
+
+    return equations
+
+
+def residual_squares(normal: Array) -> Array:
+    """(...) sums of the squared residuals of normal equations (..., 3 w, 3 w) with the depth of the centroid as unit.
+
+    The least eigenvalue hardly grows with the number of wrong points, since coefficients without depth fit anything.
+    """
+    size = normal.shape[-1]
+    known = normal + SINGULAR * np.trace(normal, axis1=-2, axis2=-1)[..., None, None] * np.eye(size)
+    return np.asarray(1.0 / np.linalg.solve(known, np.eye(size)[:, -1:])[..., -1, 0])
 
 
 def closed_form(given: LinearTransformations) -> tuple[float, Array, Array] | None:

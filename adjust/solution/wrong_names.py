@@ -7,15 +7,16 @@ affine transformation of the given fiducials to a frame shows which of them have
 
 import re
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from adjust.array_types import Array, Indices
-from adjust.initial_values.dlt import linear_transformations
+from adjust.array_types import Array, Indices, Mask
+from adjust.initial_values.dlt import equations_by_point, linear_transformations, residual_squares
 from adjust.problem.network import Image, Network
 from adjust.problem.parameter import shortened
 
@@ -26,34 +27,135 @@ WORSE, LARGE = 4.0, 0.01  # times the median misfit of the images, and misfit ab
 BETTER, MUCH_BETTER = 3.0, 10.0  # ratio by which right numbers lower the misfit of an image worse than most, or alike
 MOST_OFF = 30  # largest shift of numbers tried
 QUARTERS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))  # cosine and sine
+MOST_SHIFTED, FEWEST_SHIFTED = 3, 3  # rows by which a run of a table is shifted at most, and those of the shortest run
+BREAKS, RUN_IMAGES = 40, 4  # rows where runs are first tried to begin and end; images with most points that show them
+AS_GOOD = 2.0  # ratio of the squares of misfits up to which runs are alike: a wrong row multiplies them
 FEWEST_FIDUCIALS = 4  # of a frame, that tell by an affine transformation which are exchanged
 # Scan orientations: turned by quarters, and mirrored; the unmirrored ones first.
 TURNS = [flip @ np.array([[c, -s], [s, c]]) for flip in (np.eye(2), np.diag([-1.0, 1.0])) for c, s in QUARTERS]
 
 
 def misnumbered_images(network: Network) -> dict[str, str]:
-    """Find the frames whose point numbers are off, with the reasons; empty where all may be right."""
+    """Find the frames whose point numbers are off, with the reasons; empty where all may be right.
+
+    All frames where numbers of the given points are: see `shifted_run`.
+    """
     places, observations, fields = network.known_places, network.observations, transformed_fields(network)
     limit = WORSE * float(np.median([each.misfit for each in fields])) if fields else 0.0
     doubted = [each for each in fields if each.misfit > min(limit, LARGE)]
-    if len(fields) < FEWEST_IMAGES or not doubted:
+    if not doubted:
         return {}
     in_order = sorted(places, key=_natural)
     place_of, xyz = {name: k for k, name in enumerate(in_order)}, np.array([places[name] for name in in_order])
-    orders, frames = list(_orders(xyz)), defaultdict[str, list[str]](list)
+    orders, frames, left = list(_orders(xyz)), defaultdict[str, list[str]](list), list[TransformedField]()
     for each in doubted:
         numbers = [place_of[observations.point[row]] for row in each.rows]
         reordered = np.array([xyz[order[numbers]] for _, order in orders])
         xy_mm = np.broadcast_to(observations.xy_mm[each.rows], (*reordered.shape[:2], 2))
         misfits = linear_transformations(reordered, xy_mm).misfit
-        best = int(np.argmin(misfits))
-        if (BETTER if each.misfit > limit else MUCH_BETTER) * misfits[best] < each.misfit:
+        best, better = int(np.argmin(misfits)), BETTER if each.misfit > limit else MUCH_BETTER
+        if len(fields) >= FEWEST_IMAGES and better * misfits[best] < each.misfit:
             frames[orders[best][0]].append(each.image.frame)
+        else:
+            left.append(each)
+    if 2 * len(left) > len(fields) and (words := _shifted_points(network, left)):
+        return dict.fromkeys((image.frame for image in network.images), words)
+    for each in left if len(fields) >= FEWEST_IMAGES else ():
+        names = [observations.point[row] for row in each.rows]
+        shown, all_present = np.array([places[name] for name in names]), np.ones((1, len(names)), dtype=bool)
+        run = shifted_run(shown, observations.xy_mm[each.rows][None], all_present)
+        if run is not None and run.times > (BETTER if each.misfit > limit else MUCH_BETTER):
+            where = f"{names[run.low]} to {names[run.high - 1]}"
+            frames[f"the marks {where} have the coordinates of the {_rows_on(run.shift)}"].append(each.image.frame)
     return {
         frame: f"the points of {shortened(some, NAMED)} are not numbered as they are given: {words}. Correct them."
         for words, some in frames.items()
         for frame in some
     }
+
+
+def _shifted_points(network: Network, fields: Sequence["TransformedField"]) -> str:
+    """Describe a run of the given points whose coordinates are those of other ones; empty where there is none."""
+    names = [point.id for point in network.points if point.id in network.known_places]
+    row_of = {name: row for row, name in enumerate(names)}
+    fields = sorted(fields, key=lambda each: -len(each.rows))[:RUN_IMAGES]
+    xy_mm, present = np.zeros((len(fields), len(names), 2)), np.zeros((len(fields), len(names)), dtype=bool)
+    for image, field in enumerate(fields):
+        rows = [row_of[network.observations.point[row]] for row in field.rows]
+        xy_mm[image, rows], present[image, rows] = network.observations.xy_mm[field.rows], True
+    run = shifted_run(np.array([network.known_places[name] for name in names]), xy_mm, present)
+    if run is None or run.times < BETTER:
+        return ""
+    first, last = names[run.low + run.shift], names[run.high - 1 + run.shift]
+    return (
+        f"the points {first} to {last} are given with the coordinates of the {_rows_on(-run.shift)}: without this "
+        f"linear transformations of the points fit the images {run.times:.2g} times better. Look for a row that is "
+        f"left out or inserted near {first} and near {last}, in the points or in the marks of all images."
+    )
+
+
+def _rows_on(shift: int) -> str:
+    """Name a row by the rows from another."""
+    if abs(shift) == 1:
+        return "next row" if shift > 0 else "row before"
+    return f"row {abs(shift)} rows {'on' if shift > 0 else 'before'}"
+
+
+class ShiftedRun(NamedTuple):
+    """Rows low to high - 1 of a table, each of which is that of the name `shift` rows on.
+
+    times: ratio of the misfits of linear transformations to the images as given and with it.
+    """
+
+    low: int
+    high: int
+    shift: int
+    times: float
+
+
+def shifted_run(xyz: Array, xy_mm: Array, present: Mask) -> ShiftedRun | None:
+    """Find the run of a table's rows with which linear transformations fit best; None with too few rows.
+
+    xyz (n, 3): points of the rows; xy_mm (m, n, 2), present (m, n): places of the rows' names in m images. In the run
+    the places of a row are those of the point some rows on.
+    """
+    count = len(xyz)
+    if count < FEWEST + FEWEST_SHIFTED or (present.sum(axis=1) < FEWEST).any():
+        return None
+    equations, step = equations_by_point(xyz, xy_mm, present), -(-count // BREAKS)
+
+    def sums(shift: int) -> Array:
+        """(m, n + 1, ...) sums of the normal equations of the first rows."""
+        rows = equations(np.clip(np.arange(count) + shift, 0, count - 1))
+        sums = (rows.swapaxes(-1, -2) @ rows).cumsum(axis=1)
+        return np.concatenate([np.zeros_like(sums[:, :1]), sums], axis=1)
+
+    def best_run(shift: int, runs: Iterable[tuple[int, int]], as_good: float = 1.0) -> ShiftedRun | None:
+        """The best run, or the longest of those that are as good."""
+        least = abs(shift) + FEWEST_SHIFTED
+        some = [(low, high) for low, high in runs if low >= 0 and high <= count and least <= high - low < count]
+        if not some:
+            return None
+        (first, last), shifted = np.array(some).T, sums(shift)
+        # Rows that take from beyond the run, or give nothing to it, are left out.
+        low, high = np.maximum(first, first - shift), np.minimum(last, last - shift)
+        normal = given[:, first] + shifted[:, high] - shifted[:, low] + given[:, -1:] - given[:, last]
+        squares = residual_squares(normal).sum(axis=0)
+        alike = np.flatnonzero(squares <= as_good * squares.min())
+        best = int(alike[np.argmax((high - low)[alike])])
+        return ShiftedRun(int(low[best]), int(high[best]), shift, float(np.sqrt(as_given / squares[best])))
+
+    given = sums(0)
+    as_given = residual_squares(given[:, -1]).sum()
+    breaks, shifts = [*range(0, count, step), count], range(-MOST_SHIFTED, MOST_SHIFTED + 1)
+    found = [best_run(shift, combinations(breaks, 2)) for shift in shifts if shift]
+    run = max((each for each in found if each), key=lambda each: each.times, default=None)
+    if run is None:
+        return None
+    ends = min(run.low, run.low + run.shift), max(run.high, run.high + run.shift)
+    reach = step + MOST_SHIFTED
+    # A row that stands twice fits in the run and beyond it.
+    return best_run(run.shift, product(*(range(end - reach, end + reach + 1) for end in ends)), AS_GOOD)
 
 
 def exchanged_fiducials(network: Network) -> dict[str, str]:

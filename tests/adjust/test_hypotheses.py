@@ -208,6 +208,49 @@ def test_images_with_numbers_one_off_are_left_out_or_all_is_refused(flat: bool) 
         adjust(faults.misfit_network(everywhere, faults.Effects(numbers_off=-2), SOUND, rng))
 
 
+def _with_rows_of_others(given: Network, first: int, last: int, shift: int) -> Network:
+    """Points from the first to the last that have the coordinates of the row so many rows on."""
+    points = list(given.points)
+    points[first : last + 1] = [replace(given.points[k + shift], id=points[k].id) for k in range(first, last + 1)]
+    return replace(given, points=tuple(points))
+
+
+@pytest.mark.parametrize("first_network", [faults.blunder_network, lambda seed: faults.draw_network("nothing", seed)])
+@pytest.mark.parametrize(
+    ("first", "last", "shift", "whose"),
+    [(9, 16, 1, "next row"), (6, 12, -1, "row before"), (5, 12, 2, "row 2 rows on"), (0, 9, 3, "row 3 rows on")],
+)
+def test_a_run_of_points_with_the_coordinates_of_other_rows_is_named(
+    first_network: Callable[[int], Network], first: int, last: int, shift: int, whose: str
+) -> None:
+    """The iteration diverged, and single points were called wrong or swapped."""
+    given = first_network(0)
+    assert not adjust(given).left_out
+    names = [given.points[row].id for row in (first, last)]
+    words = f"The points {names[0]} to {names[1]} are given with the coordinates of the {whose}:"
+    with pytest.raises(AdjustmentError, match=words):
+        adjust(_with_rows_of_others(given, first, last, shift))
+
+
+@pytest.mark.parametrize("shift", [1, -2])
+@pytest.mark.parametrize("first_network", [faults.blunder_network, lambda seed: faults.draw_network("nothing", seed)])
+def test_an_image_with_a_run_of_marks_in_other_rows_is_left_out_with_the_run(
+    first_network: Callable[[int], Network], shift: int
+) -> None:
+    given = first_network(0)
+    image, xy_mm = given.images[1].name, given.observations.xy_mm.copy()
+    rows = [nets.observation_row(given, "target", image, point.id) for point in given.points[6:15]]
+    xy_mm[rows] = given.observations.xy_mm[
+        [nets.observation_row(given, "target", image, point.id) for point in given.points[6 + shift : 15 + shift]]
+    ]
+    result = adjust(nets.set_observations(given, xy_mm=xy_mm))
+    assert result.left_out.keys() == {image}
+    whose = "next row" if shift == 1 else "row 2 rows before"
+    marks = f"the marks {given.points[6].id} to {given.points[14].id} have the coordinates of the {whose}"
+    assert marks in result.left_out[image]
+    assert result.sigma0 == pytest.approx(1.0, abs=0.15)
+
+
 def _with_fiducials_named(network: Network, other: Mapping[str, str], frames: Container[str]) -> Network:
     rows = zip(network.observations.point, network.observations.kind, network.observations.image, strict=True)
     named = tuple(other.get(p, p) if kind == "fiducial" and image in frames else p for p, kind, image in rows)
