@@ -19,43 +19,63 @@ LEAST_TEXTURE_PX = 1024
 MOST_TEXTURE_PX = 3072  # px; making it takes 0.3 GB; in frames of more than about 9000 px it repeats
 PARCEL_PX = 90  # texture px, approximate width of a parcel
 MARGIN_PX = 256  # texture px; hardly any pixel is farther from the nearest seed of a parcel
-NODE_PX = 8  # px, spacing of the rays intersected with the terrain; pixels in between are interpolated
+NODE_PX = 8  # px, spacing of the places at which the texture's coordinates are computed; in between interpolated
+BEND_WAVES, BEND_TEXELS = 6, 0.5  # sines along each axis that bend the texture, and their amplitude
+BEND_WAVELENGTHS = (20.0, 40.0)  # texture px, their range
 
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """Periodic texture. texture: fractions of full scale; texel: size of its pixels, object units or mm on film."""
+    """Periodic texture, bent so that its pixels do not come at regular distances in a scan: interpolation between them
+    would otherwise show as that of a scan that was enlarged.
+
+    Attributes
+    ----------
+    texture : fractions of full scale.
+    texel : size of its pixels, object units or mm on film.
+    waves, phases_rad : (2, BEND_WAVES, 2), rad per texture px, and (2, BEND_WAVES) of the sines that bend it along its
+        columns and rows.
+    """
 
     scene: Scene
     texture: Picture
     texel: float
+    waves: Array
+    phases_rad: Array
 
     def rows(self, geometry: FrameGeometry, row0: int, height: int) -> Picture:
         """(height, width) background of rows from row0 on, as if the whole scan were exposed."""
-        if self.scene.background == "terrain":
-            return self._terrain_rows(geometry, row0, height)
-        texture_from_pixel = np.diag([1 / self.texel, 1 / self.texel, 1.0]) @ geometry.camera_from_pixel
-        texture_from_pixel = texture_from_pixel @ np.array([[1.0, 0.0, 0.0], [0.0, 1.0, row0], [0.0, 0.0, 1.0]])
-        size = (geometry.width_px, height)
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        picture = cv2.warpPerspective(self.texture, texture_from_pixel, size, None, flags, cv2.BORDER_WRAP)
-        return np.asarray(picture, np.float32)
-
-    def _terrain_rows(self, geometry: FrameGeometry, row0: int, height: int) -> Picture:
-        """Texture at the intersections of the rays with the terrain; includes distortion, film and relief."""
+        if self.scene.background == "plain":
+            return np.full((height, geometry.width_px), self.texture[0, 0], np.float32)
         first = row0 // NODE_PX
         rows = np.arange(first - 1, (row0 + height - 1) // NODE_PX + 3) * NODE_PX
         columns = np.arange(-1, (geometry.width_px - 1) // NODE_PX + 3) * NODE_PX
         nodes = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
-        plan = object_from_pixel(geometry, nodes)[:, :2].reshape(len(rows), len(columns), 2)
-        coordinates = _between(_between(plan.transpose(2, 0, 1) / self.texel).transpose(0, 2, 1)).transpose(0, 2, 1)
+        plan = np.nan_to_num(self._bent(self._plan(geometry, nodes) / self.texel))  # rays above the horizon
+        plan -= plan.min(axis=0) // len(self.texture) * len(self.texture)  # single precision is enough within it
+        coordinates = plan.T.reshape(2, len(rows), len(columns)).astype(np.float32)
+        coordinates = _between(_between(coordinates).transpose(0, 2, 1)).transpose(0, 2, 1)
         inner = coordinates[:, row0 - first * NODE_PX :][:, :height, : geometry.width_px]
-        # Only rays above the horizon miss the terrain; single precision is enough within the texture.
-        x, y = np.mod(np.nan_to_num(inner), len(self.texture)).astype(np.float32)
+        x, y = np.mod(inner, np.float32(len(self.texture)))  # cv2 takes no more than 32767
         return np.asarray(cv2.remap(self.texture, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_WRAP), np.float32)
 
+    def _plan(self, geometry: FrameGeometry, pixels: Array) -> Array:
+        """(n, 2) places of pixels (n, 2) on a wall, in mm on film, or of their rays' intersections with the terrain,
+        which include distortion, film and relief."""
+        if self.scene.background == "wall":
+            return geometry.straight_camera_from_scan(pixels)
+        return object_from_pixel(geometry, pixels)[:, :2]
 
-def _between(nodes: Array) -> Array:
+    def _bent(self, texels: Array) -> Array:
+        """(n, 2) places on the bent texture of such on the plane one."""
+        bends = [
+            np.sin(texels @ waves.T + phases).sum(axis=1)
+            for waves, phases in zip(self.waves, self.phases_rad, strict=True)
+        ]
+        return np.asarray(texels + BEND_TEXELS * np.stack(bends, axis=1))
+
+
+def _between(nodes: Picture) -> Picture:
     """Interpolate the last axis from every NODE_PX-th pixel to every pixel, by cubic Lagrange polynomials through four
     nodes; the first and the last two nodes serve as support only."""
     t = np.arange(NODE_PX) / NODE_PX
@@ -68,7 +88,7 @@ def _between(nodes: Array) -> Array:
         ]
     )
     fours = np.lib.stride_tricks.sliding_window_view(nodes, 4, axis=-1)
-    return np.asarray((fours @ weights).reshape(*nodes.shape[:-1], -1))
+    return np.asarray((fours @ weights.astype(nodes.dtype)).reshape(*nodes.shape[:-1], -1))
 
 
 def scene_background(scene: Scene) -> Background:
@@ -76,7 +96,7 @@ def scene_background(scene: Scene) -> Background:
     tones = scene.tones
     texel = TEXEL_PX * max(scene.scanner.pitch_um) / 1000
     if scene.background == "plain":
-        return Background(scene, np.full((8, 8), tones.background, np.float32), texel)
+        return Background(scene, np.full((8, 8), tones.background, np.float32), texel, *_bends(scene))
     generator = np.random.default_rng([scene.seed, 2])
     if scene.background == "wall":
         size = LEAST_TEXTURE_PX
@@ -86,7 +106,15 @@ def scene_background(scene: Scene) -> Background:
         pattern = _landscape(generator, _texture_size(_block_width(scene) / texel))
     pattern = np.clip(pattern, -3.0, 3.0)
     shares = np.clip(tones.background + tones.contrast * pattern, 0.0, 1.0)
-    return Background(scene, shares.astype(np.float32), texel)
+    return Background(scene, shares.astype(np.float32), texel, *_bends(scene))
+
+
+def _bends(scene: Scene) -> tuple[Array, Array]:
+    """Waves and phases of the sines that bend the texture."""
+    generator = np.random.default_rng([scene.seed, 7])
+    directions, phases = generator.uniform(0, 2 * np.pi, (2, 2, BEND_WAVES))
+    numbers = 2 * np.pi / generator.uniform(*BEND_WAVELENGTHS, (2, BEND_WAVES))
+    return np.stack([np.cos(directions), np.sin(directions)], axis=-1) * numbers[..., None], phases
 
 
 def _block_width(scene: Scene) -> float:

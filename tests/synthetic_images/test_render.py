@@ -18,6 +18,7 @@ from pipeline.rendered.scene_file import parse_scene
 from pipeline.text.toml_tables import Table
 from synthetic_images import scene as scenes
 from synthetic_images.areas import coverage, disk
+from synthetic_images.background import scene_background
 from synthetic_images.film import frame_geometry
 from synthetic_images.frame import frame_truth
 from synthetic_images.projection import object_rotation
@@ -82,6 +83,17 @@ def test_a_symmetric_mark_is_rendered_symmetrically(tmp_path: Path) -> None:
     picture, _ = rendered(tmp_path, scene(camera=camera, field=hidden_field()))
     assert np.abs(picture - picture[::-1, ::-1]).max() < 2e-5
     assert np.abs(picture - picture.T).max() < 2e-5
+
+
+def test_the_pixels_of_a_texture_come_at_no_regular_distance() -> None:
+    """Else interpolation between them shows in the roughness of rows, as that of an enlarged scan."""
+    scanner, tones = replace(SCANNER, pitch_um=(12.0, 12.0)), scenes.Tones(contrast=0.05)
+    made = scene(background="wall", tones=tones, scanner=scanner)
+    geometry = frame_geometry(made, 0)
+    ground = scene_background(made).rows(geometry, 0, geometry.height_px)
+    roughness = np.log(np.abs(np.diff(ground[:, 300:556], 2, axis=0)).mean(axis=1))
+    power = np.abs(np.fft.rfft((roughness - roughness.mean()) * np.hanning(len(roughness)))) ** 2
+    assert power[len(power) // 5 :].max() < 200 * np.median(power)  # texels of 3 px in rows: 100,000 times
 
 
 def test_a_chip_lies_with_its_origin_on_the_mark(tmp_path: Path) -> None:
