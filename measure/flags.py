@@ -149,6 +149,10 @@ class Cause(MeaningfulWord):
     OTHER_FRAMES = "other frames", "Disagreement with the camera's other frames."
     INTERPOLATION = "interpolation", "Interpolation between two scans, or none: nearest neighbours."
     MOTION = "motion", "Motion blur of the whole scan: the place lies anywhere in it."
+    SMEAR = (
+        "smear",
+        "Blur beyond that of the other marks: something smears it, and the place lies anywhere in that.",
+    )
     CLICK = "click", "A person pointed at it, and nothing could be matched there."
     LENS = "taking lens", "Uncertainty of the lens that photographed the film, from its calibration."
 

@@ -22,7 +22,7 @@ Kind = Literal["fiducial", "target", "tie", "join"]
 ON_FILM: tuple[Kind, ...] = ("fiducial", "join")  # kinds that are points of the film, not of the object
 # Stored results are reused only if this is unchanged. Increase it whenever measurements would change:
 # tests/measure/test_revision.py fails if that was forgotten.
-MEASURE_REVISION = 47
+MEASURE_REVISION = 48
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -60,6 +60,10 @@ class Covariance:
         if not np.any(px2):
             return self
         return Covariance({**self.parts, cause: self.parts.get(cause, np.zeros((2, 2))) + px2})
+
+    def without(self, cause: Cause) -> "Covariance":
+        """Take out the part of a cause."""
+        return Covariance({each: part for each, part in self.parts.items() if each is not cause})
 
     def through(self, matrix: Array) -> "Covariance":
         """Propagate through a matrix (2, 2) that multiplies the errors."""

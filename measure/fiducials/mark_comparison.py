@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from measure.array_types import Array, Mask
-from measure.flags import FALSE_DOUBT, MARK_UNLIKE_THE_OTHERS, NO_REASON, Code, Reason, Status
+from measure.flags import FALSE_DOUBT, MARK_UNLIKE_THE_OTHERS, NO_REASON, Cause, Code, Reason, Status
 from measure.marks.rendering import picture
 from measure.marks.shapes import Bar, MarkShape
 from measure.matching.models import PIXEL_VARIANCE_PX2, background_planes
@@ -127,6 +127,14 @@ class SharedBlur:
         moved = _log_total_px(fit.blur_px) - _log_total_px(self.blur_px)
         off = abs(moved) / np.sqrt(max(self.sigma**2 - fit.blur_sigma**2, 1e-12))
         return bool(fit.blur_sigma < self.sigma and 2 * ndtr(-off) >= MARK_UNLIKE_THE_OTHERS)
+
+
+def smear_px2(blur_px: float, usual_px: float) -> Array:
+    """(2, 2) variance by which something smears a mark of a blur beyond the usual one; 0 for a sharper mark.
+
+    A second exposure beside the first, say: each lies as far from the mean of both as the smear is wide.
+    """
+    return np.asarray(max(blur_px**2 - usual_px**2, 0.0) * np.eye(2))
 
 
 def shared_blurs(fits: Sequence[MarkFit]) -> list[SharedBlur | None]:
@@ -412,5 +420,7 @@ def _assess(mark: MarkMeasurement, findings: Mapping[str, Reason], arms: Sequenc
         near = _NEAR * float(np.hypot(quality["size_sigma"], _SIZE_SPREAD))
         if not arms or min(arms) - near <= size <= max(arms) + near:
             settled.add(unlike_others(quality["size_ratio"], quality.get("turn_rad")))
-    is_settled = mark.status is Status.WEAK and settled.issuperset(mark.reason.split("; "))
-    return replace(mark, status=Status.MEASURED, reason=NO_REASON) if is_settled else mark
+    if not (mark.status is Status.WEAK and settled.issuperset(mark.reason.split("; "))):
+        return mark
+    own = None if mark.covariance is None else mark.covariance.without(Cause.SMEAR)
+    return replace(mark, status=Status.MEASURED, reason=NO_REASON, covariance=own)

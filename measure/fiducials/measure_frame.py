@@ -30,6 +30,7 @@ from measure.fiducials.mark_comparison import (
     shared_blurs,
     shared_line_width,
     shared_shapes,
+    smear_px2,
     touch_of_round,
     unlike_blur,
     unlike_others,
@@ -338,9 +339,10 @@ class Frame:
         elif fit.lost_fraction > _MOST_LOST:
             lost = f"{fit.lost_fraction:.0%} of its edges across one direction is damaged"
             reasons.append(Reason(lost, Code.COVERED))
-        sigma_px = largest_sigma_px(fit.covariance_px2)
+        own_px2 = fit.place_covariance.without(Cause.SMEAR).px2  # a smear has a reason of its own
+        sigma_px = largest_sigma_px(own_px2)
         is_plain = fit.covariance_is_white and sigma_px <= _PLAIN_SIGMA_PX
-        if may_be_wrong(fit.covariance_px2) and not is_plain:
+        if may_be_wrong(own_px2) and not is_plain:
             reasons.append(Reason(f"its standard deviation is {sigma_px:.2f} px", Code.IMPRECISE))
         reason = Reason.combine(reasons)
         return (Status.WEAK, reason) if reason else (Status.MEASURED, NO_REASON)
@@ -742,9 +744,10 @@ def _refit_with_blur(frame: Frame) -> Frame:
     for index, blur in shared.items():
         ratio, blur_sigma = total_px[index] / usual_px, fits[index].blur_sigma
         figures = {"blur_ratio": ratio, "blur_sigma": blur_sigma} if np.isfinite(blur_sigma) else {}
-        is_unlike = blur is not None and blur.differs and index not in faint
-        reasons = [unlike_blur(ratio)] if is_unlike else []
-        amended[index] = matched.detections[index].amend(*reasons, figures=figures)
+        reasons, parts = list[Reason](), dict[Cause, Array]()
+        if blur is not None and blur.differs and index not in faint:
+            reasons, parts = [unlike_blur(ratio)], {Cause.SMEAR: smear_px2(fits[index].blur_px, blur.blur_px)}
+        amended[index] = matched.detections[index].amend(*reasons, parts=parts, figures=figures)
     return matched.replace_detections(amended)
 
 

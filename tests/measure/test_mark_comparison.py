@@ -6,7 +6,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drawn import center, chi_square, lay_out, make_scan, paint, pixel_from_camera
+from drawn import (
+    ALIKE,
+    center,
+    chi_square,
+    frame_picture,
+    lay_out,
+    make_scan,
+    measure_grey,
+    paint,
+    pixel_from_camera,
+)
 from true_marks import KIND, TrueMark, some_mark
 
 from measure import FiducialLayout, FiducialOptions, LayoutMark, MarkShape, Status, cross
@@ -37,6 +47,26 @@ def test_a_faint_mark_gets_the_blur_of_the_others_and_those_need_none() -> None:
     assert shared[4] is not None
     assert np.hypot(shared[4].blur_px, np.sqrt(PIXEL)) == pytest.approx(1.2, rel=0.01)
     assert not shared[4].differs
+
+
+def test_a_mark_exposed_twice_may_lie_where_either_exposure_does() -> None:
+    """Of four, one that lies twice on the film, 2.1 px apart: its fit is that of the mean of both."""
+    matrix = pixel_from_camera("0")
+    grey, second = frame_picture(ALIKE, matrix), np.column_stack([matrix[:, :2], matrix[:, 2] + (1.7, 1.3)])
+    paint(grey, ALIKE.marks[1].mark, ALIKE.marks[1].xy_mm, second, 9000.0)
+    marks = measure_grey(grey, ALIKE).marks
+    smeared = [mark.covariance is not None and Cause.SMEAR in mark.covariance.parts for mark in marks]
+    assert smeared == [mark.status is Status.WEAK for mark in marks] == [False, True, False, False]
+    off, claimed = center(marks[1]) - matrix @ (*ALIKE.marks[1].xy_mm, 1.0), marks[1].covariance_px2
+    assert claimed is not None
+    assert np.hypot(*off) > 0.9
+    assert off @ np.linalg.solve(claimed, off) < 4
+
+
+@pytest.mark.parametrize("smear_px2", [4.0, -1.0])
+def test_a_smear_is_what_a_blur_has_beyond_the_others(smear_px2: float) -> None:
+    added = mark_comparison.smear_px2(np.sqrt(1.5 + smear_px2), np.sqrt(1.5))
+    np.testing.assert_allclose(added, max(smear_px2, 0.0) * np.eye(2), atol=1e-12)
 
 
 @pytest.mark.parametrize("sigma_px", [0.04, 0.1])

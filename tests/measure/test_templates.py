@@ -250,13 +250,14 @@ def test_a_turn_is_compared_as_the_camera_has_it(poses: tuple[str, ...], agree: 
 def make_frames(figures: Sequence[Mapping[str, float]], doubt: Reason) -> list[FrameMeasurement]:
     """A frame for each of these figures of a mark, weak for that doubt, beside two crosses as drawn."""
     place, arms = Covariance({Cause.NOISE: 0.01 * np.eye(2)}), {f"arm{k}_ratio": 1.0 for k in range(1, 5)}
+    doubted = place.plus(Cause.SMEAR, np.eye(2))
     sigmas = {f"{name}_sigma": 0.01 for name in ("size", "blur", "arm1", "arm2", "arm3", "arm4")}
     frames = []
     for number, own in enumerate(figures):
         longer = own.get("arm1_ratio", 1.0) if own.get("arm1_ratio", 1.0) > 1 else 1.0
         others = {"size_ratio": 1.0, "blur_ratio": 1.0, **dict.fromkeys(arms, longer)}
         marks = [
-            MarkMeasurement("1", "fiducial", np.zeros(2), place, Status.WEAK, doubt, {**others, **own, **sigmas}),
+            MarkMeasurement("1", "fiducial", np.zeros(2), doubted, Status.WEAK, doubt, {**others, **own, **sigmas}),
             *(
                 MarkMeasurement(name, "fiducial", np.ones(2), place, Status.MEASURED, quality={**others, **sigmas})
                 for name in "23"
@@ -291,4 +292,7 @@ def test_a_target_with_a_fiducials_name_has_no_part_in_its_comparison() -> None:
     ],
 )  # fmt: skip
 def test_a_plate_explains_a_doubt_away(figures: Sequence[Mapping[str, float]], doubt: Reason, status: Status) -> None:
-    assert check_own_figures(make_frames(figures, doubt))[0].marks[0].status is status
+    mark = check_own_figures(make_frames(figures, doubt))[0].marks[0]
+    assert mark.covariance is not None
+    assert mark.status is status
+    assert (Cause.SMEAR in mark.covariance.parts) is (status is Status.WEAK)
