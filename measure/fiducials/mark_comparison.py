@@ -15,10 +15,11 @@ from scipy.special import ndtr
 
 from measure.array_types import Array, Mask
 from measure.flags import FALSE_DOUBT, MARK_UNLIKE_THE_OTHERS, NO_REASON, Cause, Code, Reason, Status
-from measure.marks.rendering import picture
-from measure.marks.shapes import Bar, MarkShape
+from measure.marks.rendering import picture, render
+from measure.marks.shapes import Bar, Disk, MarkShape, Part, Ring
 from measure.matching.models import PIXEL_VARIANCE_PX2, background_planes
 from measure.matching.window import ScanWindow
+from measure.noise.noise_model import covariance_along, may_be_noise
 from measure.results import FrameMeasurement, MarkFit, MarkMeasurement
 
 _FEWEST_BLURS = 3  # other marks needed to estimate their scatter in blur
@@ -43,6 +44,8 @@ _LEAST_WIDTH, _LONGEST_WIDTH = 0.03, 0.2  # of the same: a smaller change is ign
 _SHORTEST = 0.1  # lower bound of ratios: an arm shorter than this counts as missing
 _CHANGE = 0.3  # fraction of the arm's length, step of the central differences in the design matrix
 _LEAST_GAIN = 0.1  # fraction of the fitted contrast: a smaller gain is replaced by it
+_PART_STEPS, _SETTLED_PX, _APART = 12, 0.01, 13.8  # steps of parts; chi-square of their distance at p = 0.001
+_PARTS_APART_PX = 0.5  # an error that a mark with status measured must not have
 _ARM, _SHAPE, _BLUR = "arm", "shape", "blur"
 
 
@@ -311,6 +314,85 @@ def _arm_tips(mark: MarkShape) -> list[MarkShape]:
                 inner, outer = ((tip[0] * share, tip[1] * share) for share in (1 - _CHANGE, 1 + _CHANGE))
                 tips.append(replace(mark, parts=(Bar(inner, outer, bar.line_mm),)))
     return tips
+
+
+def measure_parts(
+    window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fit: MarkFit
+) -> tuple[Array, Array] | None:
+    """Fit the places of a drawing's lines, and of its rings and disks, separately, by Gauss-Newton steps.
+
+    Parameters
+    ----------
+    window, pixel_from_mark : as for `measure_arms`.
+
+    Returns
+    -------
+    (2, 2) offsets (px) of both from the matched place, and the covariance (2, 2) of their difference; None where the
+    first step finds them where they are drawn.
+    """
+    groups = lines_and_rounds(mark)
+    place = pixel_from_mark - np.column_stack([np.zeros((2, 2)), window.origin_px])
+    (height, width), used = window.grey.shape, window.usable & (window.sides == 0)
+    planes, grey, offsets = background_planes(height, width), window.grey[used], np.zeros((2, 2))
+    for number in range(_PART_STEPS):
+        first, second = (
+            _cover(replace(mark, parts=parts), np.column_stack([place[:, :2], place[:, 2] + off]), width, height, fit)
+            for parts, off in zip(groups, offsets, strict=True)
+        )
+        # Both together cover what either covers.
+        moves = [first[1:] * (second[0] - 1), second[1:] * (first[0] - 1)]
+        design = np.concatenate([*moves, (1 - (1 - first[0]) * (1 - second[0]))[None], planes])[:, used]
+        inverse: Array = np.asarray(np.linalg.pinv(design @ design.T), float)
+        solution = inverse @ (design @ grey)
+        gain, left = solution[4], np.zeros(used.shape)
+        if abs(gain) < _LEAST_GAIN * abs(fit.contrast_dn):
+            return None
+        step, left[used] = (solution[:4] / gain).reshape(2, 2), grey - solution @ design
+        offsets = offsets + step / max(float(np.hypot(*step.T).max()), 1.0)
+        variance = float(np.sum(left**2)) / max(used.sum() - len(design), 1)
+        among = variance / gain**2 * inverse[:4, :4].reshape(2, 2, 2, 2)
+        between = among[0, :, 0] + among[1, :, 1] - among[0, :, 1] - among[1, :, 0]
+        apart = step[0] - step[1]
+        if not number and apart @ np.linalg.solve(between, apart) < _APART:
+            return None
+        if np.abs(step).max() < _SETTLED_PX:
+            break
+    rho = float(np.clip(covariance_along(left, used, 1) / max(variance, 1e-300), 0.0, 0.9))
+    return offsets, between * (1 + rho) / (1 - rho)
+
+
+def lines_and_rounds(mark: MarkShape) -> list[tuple[Part, ...]]:
+    """Lines of a drawing, and its rings and disks; empty without either."""
+    lines = tuple(part for part in mark.parts if isinstance(part, Bar))
+    rounds = tuple(part for part in mark.parts if isinstance(part, Ring | Disk))
+    groups: list[tuple[Part, ...]] = [lines, rounds]
+    return groups if all(groups) else []
+
+
+def _cover(mark: MarkShape, pixel_from_mark: Array, width: int, height: int, fit: MarkFit) -> Array:
+    """(3, height, width) image of a mark under the blur of a fit, and its derivatives along columns and rows."""
+    shown = render(mark, pixel_from_mark, width, height, fit.blur_px)
+    return np.stack([shown.value, shown.by_col, shown.by_row]).astype(float)
+
+
+def parts_apart(offsets: Array, between: Array) -> tuple[Reason, Array]:
+    """Judge parts of a mark that lie apart.
+
+    Parameters
+    ----------
+    offsets, between : of `measure_parts`.
+
+    Returns
+    -------
+    Reason why the mark is weak, empty if they lie close to one another, and the (2, 2) covariance of a place that is
+    that of the one or the other; 0 if noise may be the cause.
+    """
+    apart = offsets[0] - offsets[1]
+    if may_be_noise(apart, between):
+        return NO_REASON, np.zeros((2, 2))
+    distance = float(np.hypot(*apart))
+    unlike = f"its lines lie {distance:.1f} px from its ring or disk: compare its drawing with the scan"
+    return Reason(unlike, Code.LIKENESS) if distance > _PARTS_APART_PX else NO_REASON, offsets.T @ offsets / 2
 
 
 def check_own_figures(frames: Sequence[FrameMeasurement]) -> list[FrameMeasurement]:

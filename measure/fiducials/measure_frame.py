@@ -26,7 +26,10 @@ from measure.fiducials.mark_comparison import (
     SharedBlur,
     SharedShape,
     Touch,
+    lines_and_rounds,
     measure_arms,
+    measure_parts,
+    parts_apart,
     shared_blurs,
     shared_line_width,
     shared_shapes,
@@ -60,7 +63,7 @@ from measure.marks.shapes import (
     widen_lines,
 )
 from measure.matching.models import PIXEL_VARIANCE_PX2, MatchOptions
-from measure.matching.window import read_window
+from measure.matching.window import ScanWindow, read_window
 from measure.noise.noise_model import may_be_noise
 from measure.results import MarkFit
 from measure.scans.parallel import map_in_threads
@@ -670,7 +673,7 @@ def refit_frame(frame: Frame) -> Frame:
     """
     if len(frame.inlier_fits) >= 2:
         frame = orient_frame(shift_to_curve(_refit_with_blur(_refit_with_tone(frame))))
-    return compare_shapes(_add_common_covariances(frame))
+    return compare_shapes(_compare_parts(_add_common_covariances(frame)))
 
 
 def _refit_with_tone(frame: Frame) -> Frame:
@@ -800,6 +803,27 @@ def _add_common_covariances(frame: Frame) -> Frame:
     return frame.replace_detections(amended)
 
 
+def _compare_parts(frame: Frame) -> Frame:
+    """Doubt marks whose lines lie apart from their rings or disks; each covariance grows by what lies between both."""
+    amended = {}
+    for index, fit in frame.clear_fits.items():
+        mark = frame.layout.marks[index].mark
+        if isinstance(mark, MarkShape) and lines_and_rounds(mark):
+            found = measure_parts(*_window_of(frame, index, fit), fit)
+            reason, px2 = parts_apart(*found) if found else (NO_REASON, np.zeros((2, 2)))
+            amended[index] = frame.detections[index].amend(reason, parts={Cause.UNLIKE_DRAWING: px2})
+    return frame.replace_detections(amended)
+
+
+def _window_of(frame: Frame, index: int, fit: MarkFit) -> tuple[ScanWindow, MarkShape, Array]:
+    """Window of a drawn mark at its fitted place, its drawing, and its (2, 3) placement with the frame's linear
+    part."""
+    mark = frame.layout.marks[index].mark
+    assert isinstance(mark, MarkShape)
+    place = np.column_stack([frame.linear(index), fit.center_px])
+    return read_window(frame.scan, mark_window(mark, place, frame.options.match.margin_px), frame.weights), mark, place
+
+
 def compare_shapes(frame: Frame) -> Frame:
     """Doubt marks with an outlying size or rotation; each covariance grows by what an object touching it may cause."""
     fits = {index: fit for index, fit in frame.clear_fits.items() if fit.covariance is not None}
@@ -834,9 +858,8 @@ def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape, sig
     figures = dict(zip(("size_ratio", "turn_rad"), (size_ratio, *shape.off[1:].tolist()), strict=False))
     figures |= dict(zip(("size_sigma", "turn_sigma"), sigma.tolist(), strict=False))
     if isinstance(mark, MarkShape) and mark.is_cross:
-        place = np.column_stack([frame.linear(index), fit.center_px])
-        window = read_window(frame.scan, mark_window(mark, place, frame.options.match.margin_px), frame.weights)
-        for number, (length, sigma_length) in enumerate(zip(*measure_arms(window, mark, place, fit), strict=True), 1):
+        arms = zip(*measure_arms(*_window_of(frame, index, fit), fit), strict=True)
+        for number, (length, sigma_length) in enumerate(arms, 1):
             figures |= {f"arm{number}_ratio": float(length), f"arm{number}_sigma": float(sigma_length)}
     if fit.own_shape is not None and mark.is_held_by_frame:
         middle_px = reach_px(mark, fit.pixel_from_mark[:, :2]) / 2

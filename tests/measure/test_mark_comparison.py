@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from drawn import (
     ALIKE,
+    RING_CROSS,
     center,
     chi_square,
     frame_picture,
@@ -61,6 +62,26 @@ def test_a_mark_exposed_twice_may_lie_where_either_exposure_does() -> None:
     assert claimed is not None
     assert np.hypot(*off) > 0.9
     assert off @ np.linalg.solve(claimed, off) < 4
+
+
+@pytest.mark.parametrize("apart_px", [0.0, 0.2, 3.0])
+def test_a_mark_whose_ring_lies_apart_from_its_lines_may_lie_where_either_does(apart_px: float) -> None:
+    """In all four marks alike, so that no mark differs from the others."""
+    matrix = pixel_from_camera("0")
+    lines, rings = (lay_out([MarkShape(parts)] * 4) for parts in (RING_CROSS[1:], RING_CROSS[:1]))
+    shifted = np.column_stack([matrix[:, :2], matrix[:, 2] + apart_px * np.array([0.8, -0.6])])
+    grey = frame_picture(lines, matrix)
+    covers = np.zeros((2, *grey.shape))
+    for line, ring in zip(lines.marks, rings.marks, strict=True):
+        paint(covers[0], line.mark, line.xy_mm, matrix, 1.0)
+        paint(covers[1], ring.mark, ring.xy_mm, shifted, 1.0)
+    grey += 9000 * covers[1] * (1 - covers[0])
+    for mark, given in zip(measure_grey(grey, ALIKE).marks, ALIKE.marks, strict=True):
+        assert mark.covariance is not None
+        off = center(mark) - matrix @ (*given.xy_mm, 1.0)
+        assert off @ np.linalg.solve(mark.covariance.px2, off) < (4 if apart_px else 16)
+        assert mark.status is (Status.WEAK if apart_px > 1 else Status.MEASURED)
+        assert ("its lines lie 3.0 px from its ring" in mark.reason) is (apart_px > 1)
 
 
 @pytest.mark.parametrize("smear_px2", [4.0, -1.0])
