@@ -68,10 +68,10 @@ def _name_faults(network: Network) -> Faults:
 def _camera_faults(network: Network) -> Faults:
     """Faults of cameras, and of images with an unknown camera or scanner, or with a fixed antenna station."""
     for image in network.images:
-        of: tuple[tuple[str, str, list[str]], ...] = (("camera", image.camera, list(network.camera_by_name)),)
+        references: tuple[tuple[str, str, list[str]], ...] = (("camera", image.camera, list(network.camera_by_name)),)
         if image.scanner:
-            of += (("scanner", image.scanner, list(network.scanner_by_name)),)
-        for what, name, given in of:
+            references += (("scanner", image.scanner, list(network.scanner_by_name)),)
+        for what, name, given in references:
             if name not in given:
                 known = ", ".join(sorted(given)) or "none"
                 yield f"image {image.name} is of the {what} {name}, which is not given; given: {known}."

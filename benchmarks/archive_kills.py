@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 from benchmarks.archive_stand_ins import USE, write_project
 from benchmarks.harness import ROOT, START, Row, table
 from pipeline.archive.checked_results import latest
-from pipeline.archive.results_database import Store
+from pipeline.archive.results_database import ResultsDatabase
 from pipeline.results.measured_record import mark_row, scan_detail
 
 _SCANS, _SCAN_S, _WORKERS = 200, 0.2, 2
@@ -93,11 +93,11 @@ def workers(parent: int) -> list[int]:
 
 
 def content(folder: Path) -> list[str]:
-    with Store(folder / "out" / "measurement.db") as store:
-        judging = latest(store)
-        assert judging is not None
-        keys = sorted(store.fingerprints())
-        scans = judging.scans()
+    with ResultsDatabase(folder / "out" / "measurement.db") as database:
+        check_run = latest(database)
+        assert check_run is not None
+        keys = sorted(database.fingerprints())
+        scans = check_run.scans()
         return [*keys, *(f"{scan_detail(scan, '')} {list(map(mark_row, scan.frame.marks))}" for scan in scans)]
 
 

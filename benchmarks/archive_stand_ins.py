@@ -15,9 +15,9 @@ import numpy as np
 
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
-from pipeline.archive.checked_results import CheckedResult, judge
+from pipeline.archive.checked_results import CheckedResult, store_checks
 from pipeline.archive.made_from import measured_from
-from pipeline.archive.results_database import Kept, Store
+from pipeline.archive.results_database import Kept, ResultsDatabase
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_measurement import MeasuredFile
 from pipeline.measuring.scan_task import ScanTask, scan_tasks
@@ -79,19 +79,19 @@ def _mark(point: str, xy: tuple[int, int], matrix: np.ndarray, rng: np.random.Ge
 def keep_results(project: Project) -> None:
     """Store results as `reseau measure` would; every hundredth frame lacks a fiducial."""
     home = project.path.resolve().parent
-    with Store(project.measurement_path) as store:
-        store.set_project_folder(home)
-        judging = judge(store, measured_from(project), "kept", _frames(project, store, home))
-        write_comparator(project.comparator, judging.points(), judging.pitches_um(), judging.digest)
-        judging.remember_written(project.comparator)
+    with ResultsDatabase(project.measurement_path) as database:
+        database.set_project_folder(home)
+        check_run = store_checks(database, measured_from(project), "kept", _frames(project, database, home))
+        write_comparator(project.comparator, check_run.points(), check_run.pitches_um(), check_run.digest)
+        check_run.remember_written(project.comparator)
 
 
-def _frames(project: Project, store: Store, home: Path) -> Iterator[CheckedResult]:
+def _frames(project: Project, database: ResultsDatabase, home: Path) -> Iterator[CheckedResult]:
     for number, task in enumerate(scan_tasks(project, tuple(project.scans))):
         scan = stand_in(task).scan
         scan, path = _lose_marks(scan) if number % _LOSES == 1 else scan, Path(task.scan)
         identity = FileIdentity(file_state(path, home), parts_hash(path))
-        yield CheckedResult(store.keep(Kept(identity, "{}", scan), task.name), scan)
+        yield CheckedResult(database.keep(Kept(identity, "{}", scan), task.name), scan)
 
 
 def _lose_marks(scan: MeasuredScan) -> MeasuredScan:

@@ -19,12 +19,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import synthetic_images
+from adjust.functional_model.distortion_models import UM_PER_MM
+from adjust.functional_model.lens import INTERIOR_NAMES
 from adjust.problem.parameter import Parameter
 from benchmarks.harness import table
-from pipeline.design.expected import INTERIOR, alone, expect, gains, rms
+from pipeline.design.expected import expect, gains, rms, sigmas_of_images_alone
 from pipeline.design.sweeps import Swept, Variations, over_layouts, sweep
 from pipeline.rendered.scene_tables import Sweep
-from pipeline.results.image_unit import UM_PER_MM
 
 Row = Sequence[str | float]
 
@@ -171,9 +172,9 @@ def row(plan: StudyPlan) -> tuple[list[float], int]:
     defect = 0
     for layout in range(plan.layouts):
         expected = expect(scene.setup(layout))
-        sigmas = alone(expected)
+        sigmas = sigmas_of_images_alone(expected)
         marks = [sigma for parameter, sigma in sigmas.items() if parameter.kind == "fiducial"]
-        c, x0, y0 = (sigmas[Parameter.interior(expected.camera, name)] for name in INTERIOR)
+        c, x0, y0 = (sigmas[Parameter.interior(expected.camera, name)] for name in INTERIOR_NAMES)
         at = expected.curve[0]
         found.append([UM_PER_MM * rms(marks), UM_PER_MM * c, UM_PER_MM * rms([x0, y0]), at.radial_um, at.tangential_um])
         defect = sum(sigma == math.inf for sigma in sigmas.values())

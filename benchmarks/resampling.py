@@ -20,7 +20,7 @@ from scipy.ndimage import map_coordinates
 from adjust.functional_model.transformation import Film
 from benchmarks.harness import Row, rms
 from pipeline.resampling.canvas import FrameChain
-from pipeline.resampling.resample_stage import BEST, FAST, Degree, FrameScan, ResampleTask, resampled
+from pipeline.resampling.resample_stage import BEST, FAST, Degree, FrameScan, ResampleTask, resample_frame
 
 Array = NDArray[np.float64]
 Method = Callable[[Array, Array, Array], Array]
@@ -198,7 +198,7 @@ def resample_reseau(folder: Path, degree: Degree) -> str:
     chain = FrameChain((1000.0 * PITCH_MM,) * 2, Film("affine", TURNED, np.zeros(2)))
     scans = (FrameScan("a", folder / "scan.tif", chain),)
     task = ResampleTask("a", "K", "90", PITCH_MM, degree, None, folder / "a.tif", scans)
-    done = resampled(task)
+    done = resample_frame(task)
     return done.problem or f"{done.width_px} x {done.height_px}"
 
 

@@ -64,7 +64,7 @@ def followed() -> Followed:
     from projects import write_project
 
     from pipeline.archive import measure_archive
-    from pipeline.archive.results_database import Store
+    from pipeline.archive.results_database import ResultsDatabase
     from pipeline.files.project_file import read_project
     from pipeline.progress import Reporter
     from pipeline.results.comparator_file import write_comparator
@@ -79,11 +79,11 @@ def followed() -> Followed:
         vars(measure_archive)["worker_pool"] = lambda *_: nullcontext()  # nor those in other processes
         sys.setprofile(calls)
         try:
-            with Store(project.measurement_path) as store:
+            with ResultsDatabase(project.measurement_path) as database:
                 learned = Path(place) / "learned"
-                judging = measure_archive.measure_archive(project, store, learned, Reporter(), WorkOptions())
-                assert judging is not None
-                write_comparator(project.comparator, judging.points(), judging.pitches_um())
+                check_run = measure_archive.measure_archive(project, database, learned, Reporter(), WorkOptions())
+                assert check_run is not None
+                write_comparator(project.comparator, check_run.points(), check_run.pitches_um())
         finally:
             sys.setprofile(None)
     return calls

@@ -11,7 +11,7 @@ from adjust.errors import AdjustmentError
 from measure.errors import MeasurementError
 from pipeline.commands import adjusting, exchanging, measuring
 from pipeline.commands.shared import DONE, INTERNAL_ERROR, INTERRUPTED, LOOK, WRONG_INPUT
-from pipeline.errors import InputError, what_to_do, what_to_do_about_store
+from pipeline.errors import InputError, what_to_do, what_to_do_about_database
 from pipeline.terminal import plain, spell_out_missing_letters
 from pipeline.text.files import quote_value
 
@@ -97,7 +97,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         place = f"{error.filename}: " if error.filename else ""
         return _message(f"{place}{error.strerror or error}. {what_to_do(error)}", WRONG_INPUT)
     except Exception as error:
-        if next_step := what_to_do_about_store(error):
+        if next_step := what_to_do_about_database(error):
             return _message(f"the results database cannot be written ({error}). {next_step}", WRONG_INPUT)
         import traceback
 

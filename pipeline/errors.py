@@ -11,7 +11,7 @@ _ADVICE = {
     errno.ENAMETOOLONG: "Choose a shorter name.",
     errno.ENOMEM: "Close other programs: the memory is full.",
 }
-_OF_STORE = {
+_OF_DATABASE = {
     **dict.fromkeys((sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR), f"{_ROOM} What was measured is kept."),
     **dict.fromkeys((sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM), _PERMISSION),
     sqlite3.SQLITE_BUSY: "Another process has it: let that end first.",
@@ -38,6 +38,6 @@ def what_to_do(error: OSError) -> str:
     return _ADVICE.get(error.errno or 0, "Check the path, and that the drive is there.")
 
 
-def what_to_do_about_store(error: BaseException) -> str:
+def what_to_do_about_database(error: BaseException) -> str:
     """Remedy for an operating-system error within SQLite; "" for other errors."""
-    return _OF_STORE.get(getattr(error, "sqlite_errorcode", 0) & 0xFF, "")
+    return _OF_DATABASE.get(getattr(error, "sqlite_errorcode", 0) & 0xFF, "")

@@ -63,7 +63,7 @@ class Unpublished:
         for path in (*files.values(), *self._removed):
             _check_replaceable(path, comparator)
         done: list[str] = []
-        with _undisturbed():
+        with _deferred_interrupts():
             try:
                 for place, path in files.items():
                     with writing(path):
@@ -109,7 +109,7 @@ def unpublished(project: Project) -> Iterator[Unpublished]:
 
 
 @contextmanager
-def _undisturbed() -> Iterator[None]:
+def _deferred_interrupts() -> Iterator[None]:
     """Defer interrupts until the short block ends, so that results are not published by halves."""
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -14,12 +14,12 @@ from adjust.solution.result import Adjustment
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.network import anything_to_adjust, check_transformation
 from pipeline.adjusting.picture_turn import picture_turn
-from pipeline.archive.checked_results import Judging, measured_scans, read_measurement, stored_judging
+from pipeline.archive.checked_results import CheckRun, measured_scans, read_measurement, stored_check_run
 from pipeline.archive.made_from import adjusted_from, differing
-from pipeline.archive.results_database import Merged, Store, check_mergeable, merge
+from pipeline.archive.results_database import Merged, ResultsDatabase, check_mergeable, merge
 from pipeline.archive.schema import DamagedError, single_writer
 from pipeline.archive.status import ArchiveStatus, archive_status
-from pipeline.archive.thumbnails import Thumbnails, ThumbnailStore
+from pipeline.archive.thumbnails import ThumbnailDatabase, Thumbnails
 from pipeline.archive.verdicts import Verdict
 from pipeline.errors import InputError, WriteError
 from pipeline.files.object_files import WRITTEN, fill_images
@@ -28,7 +28,7 @@ from pipeline.progress import Reporter
 from pipeline.provenance import hash_file
 from pipeline.publishing import Unpublished, unpublished
 from pipeline.report.data import ReportData
-from pipeline.report.load import adjusted_data, frame_data, measured_data, report_data, with_stored_adjustment
+from pipeline.report.load import adjusted_data, frame_data, measured_data, note_stored_adjustment, report_data
 from pipeline.report.page import write_frame_page, write_report
 from pipeline.results import comparator_file
 from pipeline.results.adjustment_file import covariance_path, read_adjustment, write_adjustment
@@ -37,7 +37,7 @@ from pipeline.results.record_json import write_record
 from pipeline.summary import Summary, archive_summary, summarise
 from pipeline.workers import NotMeasured, WorkOptions
 
-_ONE_BY_ONE = 2000  # scans; for more, the summary is read from the store: totals and what needs a look
+_ONE_BY_ONE = 2000  # scans; for more, the summary is read from the database: totals and what needs a look
 
 
 def run_all(project: Project, reporter: Reporter, work: WorkOptions | None = None) -> Summary:
@@ -71,20 +71,20 @@ def run_all(project: Project, reporter: Reporter, work: WorkOptions | None = Non
 
 
 def run_measure(project: Project, reporter: Reporter, work: WorkOptions | None = None) -> Summary:
-    """Measure scans into comparator.csv; a shard only into its own store, for `reseau merge`."""
+    """Measure scans into comparator.csv; a shard only into its own database, for `reseau merge`."""
     with _running(project, reporter, work, True) as run:
         if work is not None and work.shard is not None:
             part, parts = work.shard
             path = project.shard_path(part, parts)
-            with Store(path) as store:
-                run.measure_into(store)
+            with ResultsDatabase(path) as database:
+                run.measure_into(database)
             scans = archive_status(project, path).scans
             own = tuple(scan for scan in scans if scan.verdict not in (Verdict.WAITING, Verdict.OLD))
             return replace(archive_summary(ArchiveStatus(own), {f"part {part} of {parts}": path}), parts=parts)
         digest = run.measure()
         data = None
         if len(project.scans) <= _ONE_BY_ONE:
-            data = with_stored_adjustment(measured_data(project, run.new.current_path), project)
+            data = note_stored_adjustment(measured_data(project, run.new.current_path), project)
         run.publish()
     if project.images_path is not None:
         run.fill_images(measured_scans(project.measurement_path, digest))
@@ -92,15 +92,15 @@ def run_measure(project: Project, reporter: Reporter, work: WorkOptions | None =
     return summarise(data, files) if data is not None else archive_summary(archive_status(project), files)
 
 
-def run_merge(project: Project, stores: Sequence[Path], reporter: Reporter) -> tuple[list[Merged], Summary]:
-    """Merge the stores of shards into that of the project; if they hold all its scans, run the cross-scan checks and
+def run_merge(project: Project, databases: Sequence[Path], reporter: Reporter) -> tuple[list[Merged], Summary]:
+    """Merge the databases of shards into that of the project; if they hold all its scans, run the cross-scan checks and
     write comparator.csv."""
-    check_mergeable(project.measurement_path, stores)
+    check_mergeable(project.measurement_path, databases)
     path = project.measurement_path
     path.parent.mkdir(parents=True, exist_ok=True)
-    with single_writer(path), Store(path) as store, ThumbnailStore(store.path) as thumbnails:
-        taken = merge(store, stores)
-        thumbnails.take(stores)
+    with single_writer(path), ResultsDatabase(path) as database, ThumbnailDatabase(database.path) as thumbnails:
+        taken = merge(database, databases)
+        thumbnails.take(databases)
     try:
         return taken, run_measure(project, reporter, WorkOptions(only_kept=True))
     except NotMeasured:
@@ -180,8 +180,8 @@ def _running(
     project: Project, reporter: Reporter, work: WorkOptions | None = None, measures: bool = False
 ) -> Iterator["_Run"]:
     shard = work.shard if work is not None else None
-    store = project.measurement_path if shard is None else project.shard_path(*shard)
-    with unpublished(project) as new, single_writer(store) if measures else nullcontext():
+    database = project.measurement_path if shard is None else project.shard_path(*shard)
+    with unpublished(project) as new, single_writer(database) if measures else nullcontext():
         yield _Run(project, new, reporter, work or WorkOptions())
 
 
@@ -201,30 +201,30 @@ class _Run:
             yield
 
     def measure(self) -> str:
-        """Measure the missing scans, write the marks of all scans, and return the digest of their judging."""
-        with Store(self.project.measurement_path) as store:
+        """Measure the missing scans, write the marks of all scans, and return the digest of their check run."""
+        with ResultsDatabase(self.project.measurement_path) as database:
             try:
-                return self._measured_and_written(store)
+                return self._measure_and_write(database)
             except DamagedError as error:  # of a mark: detected only when it is read
                 if self.work.only_kept:
                     raise
                 self.reporter.say(str(error))
-                store.forget_damaged()
-                return self._measured_and_written(store)
+                database.forget_damaged()
+                return self._measure_and_write(database)
 
-    def _measured_and_written(self, store: Store) -> str:
-        judging = self.measure_into(store)
-        assert judging is not None  # it is no shard
-        if not judging.is_written(self.project.comparator):
-            self._write_marks(judging)
-        return judging.digest
+    def _measure_and_write(self, database: ResultsDatabase) -> str:
+        check_run = self.measure_into(database)
+        assert check_run is not None  # it is no shard
+        if not check_run.is_written(self.project.comparator):
+            self._write_marks(check_run)
+        return check_run.digest
 
-    def measure_into(self, store: Store) -> Judging | None:
+    def measure_into(self, database: ResultsDatabase) -> CheckRun | None:
         """Measure the missing scans of the project or of a shard."""
         from pipeline.archive.measure_archive import measure_archive
 
         learned = self.new.place(self.project.output / "learned")
-        return measure_archive(self.project, store, learned, self.reporter, self.work)
+        return measure_archive(self.project, database, learned, self.reporter, self.work)
 
     def adjust_twice(self, scans: Sequence[MeasuredScan]) -> Adjustment | None:
         """Adjustment, repeated after a second pass that found more targets; None where there is nothing to adjust."""
@@ -240,9 +240,9 @@ class _Run:
         again = measure_again(project, scans, adjustment, self.reporter, lambda: open_executor(project, self.work))
         if again is None:
             return adjustment
-        with self._judging() as before:
+        with self._check_run() as before:
             assert before is not None
-            self._write_marks(before.rejudge(again, project.adjust))
+            self._write_marks(before.store_second_pass(again, project.adjust))
         return adjust_marks(project, self.marks())
 
     def marks(self) -> tuple[comparator_file.ComparatorPoint, ...]:
@@ -259,33 +259,33 @@ class _Run:
             )
         return path
 
-    def _judging(self) -> AbstractContextManager[Judging | None]:
-        """Judging that comparator.csv names; None where it is not from the results database."""
+    def _check_run(self) -> AbstractContextManager[CheckRun | None]:
+        """Check run that comparator.csv names; None where it is not from the results database."""
         project = self.project
-        return stored_judging(
+        return stored_check_run(
             project.measurement_path, comparator_file.read_measurement_hash(self.new.current_path(project.comparator))
         )
 
-    def _write_marks(self, judging: Judging) -> None:
-        project, new, decisions = self.project, self.new, judging.decisions()
+    def _write_marks(self, check_run: CheckRun) -> None:
+        project, new, decisions = self.project, self.new, check_run.decisions()
         for camera in project.cameras.values():
             if camera.clicks is not None and camera.clicks.who:  # the clicks count as one more decision
                 who = camera.path.name, camera.clicks.who
                 decisions[who] = decisions.get(who, 0) + 1
         place = new.place(project.comparator)
-        comparator_file.write_comparator(place, judging.points(), judging.pitches_um(), judging.digest, decisions)
-        if not write_frames(new.place(project.frames_path), judging.written_scans()):
+        comparator_file.write_comparator(place, check_run.points(), check_run.pitches_um(), check_run.digest, decisions)
+        if not write_frames(new.place(project.frames_path), check_run.written_scans()):
             new.remove(project.frames_path)
 
     def publish(self) -> None:
-        """Publish all results, then delete earlier judgings, which no file names any more."""
+        """Publish all results, then delete earlier check runs, which no file names any more."""
         self.new.publish()
         if not (self.project.scans and self.project.comparator.exists()):
             return
-        with self._judging() as judging:
-            if judging is not None:
-                judging.drop_others()
-                judging.remember_written(self.project.comparator)
+        with self._check_run() as check_run:
+            if check_run is not None:
+                check_run.drop_others()
+                check_run.remember_written(self.project.comparator)
 
     def fill_images(self, scans: Iterable[MeasuredScan]) -> None:
         """Fill empty columns of the user's images.csv with the writing read on the film."""
@@ -294,8 +294,8 @@ class _Run:
 
     def write_adjustment(self, adjustment: Adjustment, marks: Sequence[comparator_file.ComparatorPoint]) -> None:
         project = self.project
-        with self._judging() as judging:
-            sizes = judging.sizes_mm() if judging is not None else {}
+        with self._check_run() as check_run:
+            sizes = check_run.sizes_mm() if check_run is not None else {}
         frames_mm: dict[str, tuple[float, float]] = {}  # by camera; without fiducials and frame size, its largest image
         for image, size in sizes.items():
             camera = project.image_camera(image)
@@ -335,6 +335,6 @@ class _Run:
     def thumbnails(self, data: ReportData) -> Thumbnails:
         """Thumbnails of the marks in the data."""
         scans, path = data.measurement or {}, self.project.measurement_path
-        with stored_judging(path, data.made_from.get(path.name, "")) as judging:
-            keys = judging.fingerprints(scans) if judging is not None else {}
+        with stored_check_run(path, data.made_from.get(path.name, "")) as check_run:
+            keys = check_run.fingerprints(scans) if check_run is not None else {}
         return Thumbnails(scans.values(), self.project.max_pixels, path, keys)

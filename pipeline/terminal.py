@@ -70,7 +70,7 @@ class _Patient(io.FileIO):
 
 def spell_out_missing_letters() -> None:
     """Make the standard streams replace characters that their encoding lacks (Latin-1, ASCII)."""
-    codecs.register_error(_NAME, _spelled)
+    codecs.register_error(_NAME, _escape_letter)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors=_NAME)
@@ -79,7 +79,7 @@ def spell_out_missing_letters() -> None:
 _NAME = "reseau-spelled"
 
 
-def _spelled(error: UnicodeError) -> tuple[str, int]:
+def _escape_letter(error: UnicodeError) -> tuple[str, int]:
     if not isinstance(error, UnicodeEncodeError):
         raise error
     letters = error.object[error.start : error.end]

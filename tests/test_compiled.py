@@ -13,7 +13,7 @@ from reference_cases import CASES, case_approximations, case_network, load
 import compiled
 from adjust.functional_model.projection import LineOfSight
 from adjust.linear_algebra import elimination, fronts
-from adjust.linear_algebra.elimination import SparseBlocks, eliminated
+from adjust.linear_algebra.elimination import SparseBlocks, eliminate_blocks
 from adjust.linear_algebra.factor import Blocks
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.normal_equations import SharedEquations, SparseRows, SparsityPattern
@@ -153,7 +153,7 @@ def eliminate(rows: SparseRows) -> tuple[SparseBlocks, SharedEquations, NDArray[
     equations = rows.equations(Fronts.single(40))
     scale = np.sqrt(rows.column_squares(unknowns, equations))
     scale[scale == 0.0] = 1.0
-    blocks = eliminated(rows, rng.uniform(0.1, 1.0, unknowns), rng.normal(size=unknowns), scale, equations)
+    blocks = eliminate_blocks(rows, rng.uniform(0.1, 1.0, unknowns), rng.normal(size=unknowns), scale, equations)
     shared = np.triu(rng.normal(size=(40, 40)))
     shared[range(40), range(40)] = 5.0
     triangle = Triangle(Fronts.single(40), (shared,), (np.empty((40, 0)),))
@@ -184,7 +184,7 @@ def test_own_columns_are_orthonormal_even_if_nearly_parallel(loops: str, monkeyp
     rows = sparse_rows(1)
     rows.matrix[..., 1] = rows.matrix[..., 0] + 1e-7 * rows.matrix[..., 1]
     nothing, equations = np.zeros(160), SharedEquations.zeros(Fronts.single(40))
-    blocks = eliminated(rows, nothing, nothing, np.ones(160), equations)
+    blocks = eliminate_blocks(rows, nothing, nothing, np.ones(160), equations)
     first, stop = rows.pattern.first[10:12]
     columns = blocks.orthonormal[..., first:stop].reshape(3, -1)
     np.testing.assert_allclose(columns @ columns.T, np.eye(3), atol=1e-14)

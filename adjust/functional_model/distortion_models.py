@@ -183,41 +183,46 @@ GRUEN = _polynomial_set(
 )
 
 
-def degree_groups(of: PolynomialSet) -> tuple[tuple[str, tuple[str, ...]], ...]:
+def degree_groups(polynomial_set: PolynomialSet) -> tuple[tuple[str, tuple[str, ...]], ...]:
     """Group the parameters by their total degree in x and y."""
-    degrees = [COMBINED[term] if isinstance(term, str) else sum(term[1:]) for term in of.terms]
+    degrees = [COMBINED[term] if isinstance(term, str) else sum(term[1:]) for term in polynomial_set.terms]
     return tuple(
-        (f"degree {degree}", tuple(name for name, own in zip(of.names, degrees, strict=True) if own == degree))
+        (
+            f"degree {degree}",
+            tuple(name for name, own in zip(polynomial_set.names, degrees, strict=True) if own == degree),
+        )
         for degree in sorted(set(degrees))
     )
 
 
-def correct(of: PolynomialSet, settings: Settings, xy: Array, principal_point: Array, parameters: Array) -> Correction:
+def correct(
+    polynomial_set: PolynomialSet, settings: Settings, xy: Array, principal_point: Array, parameters: Array
+) -> Correction:
     """Compute the correction of a set. It is subtracted from the observed point."""
-    return summed(of, np.array(settings.half_mm), xy, principal_point, parameters)
+    return sum_terms(polynomial_set, np.array(settings.half_mm), xy, principal_point, parameters)
 
 
-def summed(of: PolynomialSet, half: Array, xy: Array, center: Array, parameters: Array) -> Correction:
+def sum_terms(polynomial_set: PolynomialSet, half: Array, xy: Array, center: Array, parameters: Array) -> Correction:
     """Sum the terms of a set times their parameters (k,) at places (n, 2); center, half (2,) of the extent."""
-    return _polynomial_terms(of, float(half[1] / half[0])).correction(xy, center, parameters, half)
+    return _polynomial_terms(polynomial_set, float(half[1] / half[0])).correction(xy, center, parameters, half)
 
 
 @lru_cache
-def _polynomial_terms(of: PolynomialSet, ratio: float) -> PolynomialTerms:
+def _polynomial_terms(polynomial_set: PolynomialSet, ratio: float) -> PolynomialTerms:
     """Terms of a set; ratio: by / bx."""
     q = np.sqrt(ratio)
     combinations = {
         STRETCH: ((q, (0, 1, 0)), (-1 / q, (1, 0, 1))),
         SHEAR: ((1 / q, (0, 0, 1)), (q, (1, 1, 0))),
-        TILT_X: ((-of.tilt * q, (0, 2, 0)), (1 / q, (1, 1, 1))),
-        TILT_Y: ((q, (0, 1, 1)), (-of.tilt / q, (1, 0, 2))),
+        TILT_X: ((-polynomial_set.tilt * q, (0, 2, 0)), (1 / q, (1, 1, 1))),
+        TILT_Y: ((q, (0, 1, 1)), (-polynomial_set.tilt / q, (1, 0, 2))),
     }
     in_x, in_y = (
-        [{exponents(i): c for i, c in enumerate(p)} for p in of.polynomials]
+        [{exponents(i): c for i, c in enumerate(p)} for p in polynomial_set.polynomials]
         for exponents in (lambda i: (i, 0), lambda i: (0, i))
     )
     terms = []
-    for term in of.terms:
+    for term in polynomial_set.terms:
         products = combinations[term] if isinstance(term, str) else ((1.0, term),)
         dx, dy = (
             combined(*((factor, (in_x[m], in_y[n])) for factor, (own, m, n) in products if own == axis))

@@ -12,15 +12,7 @@ from functools import lru_cache, partial
 import numpy as np
 
 from adjust.array_types import Array
-from adjust.functional_model import distortion_models, opencv_family
-from adjust.functional_model.correction import (
-    Correct,
-    Image,
-    ideal_point_family,
-    no_correction,
-    ray_family,
-    undistorted,
-)
+from adjust.functional_model import correction, distortion_models, opencv_family
 
 LEGENDRE_ORDERS = range(2, 10)  # from 2, the degree of the omitted tilts, to 9, so that an index has one digit
 FOURIER_ORDERS = range(1, 10)
@@ -31,8 +23,10 @@ class Family:
     """Distortion family."""
 
     parameters: tuple[str, ...] = ()  # names of the parameters
-    image: Image = undistorted  # image of a ray (object-side families)
-    correct: Correct = no_correction  # correction subtracted from the observed point (image-side families)
+    image: correction.Image = correction.undistorted  # image of a ray (object-side families)
+    correct: correction.Correct = (
+        correction.no_correction
+    )  # correction subtracted from the observed point (image-side families)
     units: tuple[str, ...] = ()  # units of the parameters; empty: mm
     needs: str = ""  # name of a required setting of `Distortion`
     y_down: tuple[str, ...] = ()  # parameters defined with y down that would change sign with y up
@@ -78,14 +72,14 @@ _FAMILIES = {
     "australis": replace(_BROWN, correct=distortion_models.australis),
     "aicon": Family(
         ("a1", "a2", "a3", "b1", "b2", "c1", "c2"),
-        image=ideal_point_family(distortion_models.aicon),
+        image=correction.ideal_point_family(distortion_models.aicon),
         units=(*_UNITS, "–", "–"),
         groups=(("radial", ("a1", "a2", "a3")), ("decentering", ("b1", "b2")), ("affinity", ("c1", "c2"))),
         ladder=("a1", "a1 a2", "a1 b1 b2", "a1 a2 b1 b2", "a1 a2 a3 b1 b2"),
     ),
     "opencv": Family(
         opencv_family.OPENCV_NAMES,
-        image=ray_family(opencv_family.opencv),
+        image=correction.ray_family(opencv_family.opencv),
         units=(*["–"] * 12, "rad", "rad", "–", "–"),
         y_down=("p1", "s3", "s4", "tau_x", "b2"),
         groups=(
@@ -98,11 +92,11 @@ _FAMILIES = {
         ),
         ladder=("k1", "k1 k2", "k1 p1 p2", "k1 k2 p1 p2", "k1 k2 p1 p2 k3"),
         alike_at_zero=opencv_family.OPENCV_DENOMINATOR,
-        apart=opencv_family.expanded,
+        apart=opencv_family.expand_parameters,
     ),
     "opencv_fisheye": Family(
         opencv_family.FISHEYE_NAMES,
-        image=ray_family(opencv_family.opencv_fisheye),
+        image=correction.ray_family(opencv_family.opencv_fisheye),
         units=("–",) * len(opencv_family.FISHEYE_NAMES),
         y_down=("b2",),
         groups=(("radial", ("k1", "k2", "k3", "k4")), ("affinity", ("b1", "b2"))),

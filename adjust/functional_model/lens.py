@@ -70,6 +70,11 @@ class Distortion:
             raise ValueError(f"half the frame must be two lengths in mm, not {self.half_mm}")
 
     @property
+    def free(self) -> frozenset[str]:
+        """Names of the parameters that are estimated."""
+        return frozenset(name for name, prior in self.parameters.items() if prior.sigma > 0.0)
+
+    @property
     def values(self) -> Array:
         """(k,) prior values of the family's parameters, 0 where none is given."""
         given = self.parameters
@@ -163,8 +168,10 @@ class Lens:
 
     def equations(self, xy_mm: Array, ray: Array) -> ImageEquations:
         """Evaluate the condition equations of observed camera points (n, 2) in mm and rays (n, 2), -U/W and -V/W."""
-        of = family(self.distortion.family)
-        return self.equations_with_image(xy_mm, of.image(self.distortion, self.interior[0], ray, self.parameters))
+        lens_family = family(self.distortion.family)
+        return self.equations_with_image(
+            xy_mm, lens_family.image(self.distortion, self.interior[0], ray, self.parameters)
+        )
 
     def equations_with_image(self, xy_mm: Array, imaged: Imaged) -> ImageEquations:
         """Evaluate the condition equations of observed camera points (n, 2) and imaged rays."""
@@ -188,7 +195,7 @@ class Lens:
         correct = family(self.distortion.family).correct
         with np.errstate(over="ignore", invalid="ignore"):
             ideal_mm = principal_point + imaged.value
-            unfolded = _unfolded(determinant(imaged.ray_jacobian))
+            unfolded = _is_unfolded(determinant(imaged.ray_jacobian))
             if correct is no_correction:
                 return ideal_mm, unfolded & np.isfinite(ideal_mm).all(axis=1)
             tolerance_mm = 4 * NEWTON_TOLERANCE * (abs(c) + np.abs(ideal_mm).max(axis=1))
@@ -229,7 +236,7 @@ class Lens:
         with np.errstate(over="ignore", invalid="ignore"):
             at = self.equations(xy_mm, ray)
             sides = determinant(at.xy_jacobian), determinant(at.imaged.ray_jacobian)
-        return ~(found & _unfolded(sides[0]) & _unfolded(sides[1]))
+        return ~(found & _is_unfolded(sides[0]) & _is_unfolded(sides[1]))
 
     def displacement(self, from_principal_point_mm: Array) -> Displacement:
         """Compute the distortion at observed points (n, 2) in mm relative to the principal point.
@@ -250,6 +257,6 @@ class Lens:
         return Displacement(np.where(imaged[:, None], 1e3 * (xy_mm - ideal_mm), np.nan), 1e3 * derivatives, imaged)
 
 
-def _unfolded(side: Array) -> Mask:
+def _is_unfolded(side: Array) -> Mask:
     """Mask of determinants (n,) that are finite and positive: the image is not folded over."""
     return np.asarray(np.isfinite(side) & (side > 0.0))

@@ -96,7 +96,7 @@ def _camera_axes(lens: DistortedRay, b1: float, b2: float, first: int) -> Distor
     return DistortedRay(camera_axes(lens.value.T).T, ray_jacobian * DOWN, parameter_derivative)
 
 
-def expanded(parameters: Array) -> Array:
+def expand_parameters(parameters: Array) -> Array:
     """Multiply numerator and denominator of the radial distortion by 1 + r²; powers above the sixth are dropped."""
     k = dict(zip(OPENCV_NAMES, parameters, strict=True))
     for names in (("k1", "k2", "k3"), OPENCV_DENOMINATOR):

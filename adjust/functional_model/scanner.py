@@ -22,7 +22,7 @@ import numpy as np
 
 from adjust.array_types import Array, Mask
 from adjust.functional_model.correction import Correction, no_correction
-from adjust.functional_model.distortion_models import COMBINED, PolynomialSet, Term, legendre_terms, summed
+from adjust.functional_model.distortion_models import COMBINED, PolynomialSet, Term, legendre_terms, sum_terms
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.transformation import polynomial_order
 from adjust.linear_algebra.small_matrices import newton, product
@@ -107,7 +107,7 @@ class Bend:
         bend = no_correction(Distortion(), straight_mm, np.zeros(2), parameters)
         if self.terms:
             half, center = np.array(self.half_mm), np.array(self.center_mm)
-            bend = summed(self._polynomial_set, half, straight_mm, center, parameters)
+            bend = sum_terms(self._polynomial_set, half, straight_mm, center, parameters)
         if self.lens is None:
             return bend
         # The derivatives follow from the lens's condition equations by the implicit function theorem.

@@ -27,7 +27,7 @@ from math import comb
 import numpy as np
 
 from adjust.array_types import Array, Mask
-from adjust.linear_algebra.small_matrices import NEWTON_STEPS, applied, determinant, solved
+from adjust.linear_algebra.small_matrices import NEWTON_STEPS, applied, determinant, solve_pairs
 
 NEWTON_TOLERANCE = 1e-9  # fraction of a coordinate: the remaining error is the square of the last step
 HIGHEST_ORDER = 5  # of polynomials: 21 terms an axis, more than fiducial marks of frames determine
@@ -87,7 +87,7 @@ class FilmKind(ABC):
         with np.errstate(over="ignore", invalid="ignore"):
             for number in range(steps):
                 gradient = self.gradient(parameters, xy) if number else at_center
-                step, regular = _solved(gradient, self.apply(parameters, xy) - camera_xy)
+                step, regular = _solve_pairs(gradient, self.apply(parameters, xy) - camera_xy)
                 xy = xy - step
                 settled = np.abs(step).max(axis=-1) <= NEWTON_TOLERANCE * (1.0 + np.abs(xy).max(axis=-1))
                 found = regular & (settled | (self.degree == 1))
@@ -274,7 +274,7 @@ class Projective(FilmKind):
 
     def inverse(self, parameters: Array, camera_xy: Array, center: Array) -> tuple[Array, Mask]:
         bent = camera_xy[..., :, None] * parameters[..., None, 6:]
-        solution, regular = _solved(self._linear(parameters) - bent, camera_xy - parameters[..., [0, 3]])
+        solution, regular = _solve_pairs(self._linear(parameters) - bent, camera_xy - parameters[..., [0, 3]])
         same_side = self._denominator(parameters, solution) * self._denominator(parameters, center) > 0.0
         return solution, np.asarray(regular & same_side)  # beyond the horizon the image is upside down
 
@@ -285,11 +285,11 @@ class Projective(FilmKind):
         return np.asarray(1.0 + (parameters[..., 6:] * xy).sum(-1))
 
 
-def _solved(matrix: Array, right: Array) -> tuple[Array, Mask]:
+def _solve_pairs(matrix: Array, right: Array) -> tuple[Array, Mask]:
     """Solutions (n, 2) of 2x2 systems (n, 2, 2), and the mask (n,) of regular matrices."""
-    of = determinant(matrix)
-    regular = np.isfinite(of) & (of != 0.0)
-    return solved(matrix, right, regular, of), regular
+    det = determinant(matrix)
+    regular = np.isfinite(det) & (det != 0.0)
+    return solve_pairs(matrix, right, regular, det), regular
 
 
 FILM_NAMES = ("none", "congruent", "similarity", "affine", "projective", "bilinear", "conformal(n)", "polynomial(n)")
@@ -427,7 +427,7 @@ def fit_transformation(transformation: str, comparator_mm: Array, camera_mm: Arr
     mirrored = False
     if len(comparator_mm) >= 3:
         kinds = [film_kind("similarity", is_mirrored) for is_mirrored in (False, True)]
-        squared = _squared(kinds[0], _fit(kinds[0], comparator_mm, camera_mm), comparator_mm, camera_mm)
+        squared = _complex_square(kinds[0], _fit(kinds[0], comparator_mm, camera_mm), comparator_mm, camera_mm)
         if not _agree(squared):
             costs = [_robust_fit(each, comparator_mm, camera_mm)[1] for each in kinds]
             mirrored = costs[1] < PLAINLY * costs[0]
@@ -444,7 +444,7 @@ def _robust_fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> tuple
     n, fewest = len(comparator_mm), least_marks(kind)
     half = (n + fewest + 1) // 2
     best = _fit(kind, comparator_mm, camera_mm)
-    squared = _squared(kind, best, comparator_mm, camera_mm)
+    squared = _complex_square(kind, best, comparator_mm, camera_mm)
     best_cost = float(np.sort(squared)[:half].sum())
     if half == n or _agree(squared):
         return best, best_cost
@@ -455,13 +455,13 @@ def _robust_fit(kind: FilmKind, comparator_mm: Array, camera_mm: Array) -> tuple
         kept = np.array([generator.permutation(n)[:fewest] for _ in range(MOST_SUBSETS)])
     for _ in range(3):
         candidates = _fit(kind, comparator_mm[kept], camera_mm[kept])
-        squared = _squared(kind, candidates[:, None], comparator_mm, camera_mm)
+        squared = _complex_square(kind, candidates[:, None], comparator_mm, camera_mm)
         kept = np.argsort(squared, axis=1, kind="stable")[:, :half]
     costs = np.take_along_axis(squared, kept, axis=1).sum(axis=1)
     if costs.min() < best_cost:
         best, best_cost = candidates[costs.argmin()], float(costs.min())
     variance = best_cost / (2 * half - len(kind.names))
-    agree = _squared(kind, best, comparator_mm, camera_mm) < GROSS * max(variance, LEAST_VARIANCE_MM2)
+    agree = _complex_square(kind, best, comparator_mm, camera_mm) < GROSS * max(variance, LEAST_VARIANCE_MM2)
     return _fit(kind, comparator_mm[agree], camera_mm[agree]), best_cost
 
 
@@ -470,7 +470,7 @@ def _agree(squared: Array) -> bool:
     return bool((squared < GROSS * LEAST_VARIANCE_MM2).all())
 
 
-def _squared(kind: FilmKind, parameters: Array, comparator_mm: Array, camera_mm: Array) -> Array:
+def _complex_square(kind: FilmKind, parameters: Array, comparator_mm: Array, camera_mm: Array) -> Array:
     with np.errstate(all="ignore"):  # a subset of poor geometry may map other marks to infinity
         squared = ((kind.apply(parameters, comparator_mm) - camera_mm) ** 2).sum(axis=-1)
     return np.where(np.isfinite(squared), squared, np.inf)

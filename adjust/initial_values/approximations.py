@@ -18,7 +18,7 @@ from adjust.functional_model.families import family
 from adjust.functional_model.lens import Lens
 from adjust.functional_model.rotation import angles_from_rotation, angles_near, rotation_from_angles
 from adjust.functional_model.transformation import LATTICE, film_kind, fit_transformation
-from adjust.initial_values.model_formation import BlockState, extend, intersected, known_field, orient_free_model
+from adjust.initial_values.model_formation import BlockState, extend, intersect_points, known_field, orient_free_model
 from adjust.initial_values.pose import KnownField, Pose, Sight, image_distances
 from adjust.initial_values.resection import FEWEST, find_principal_distance, find_wide_distance, resect_images
 from adjust.problem.camera import Camera
@@ -326,7 +326,7 @@ def _all_points(block: BlockState) -> dict[str, Array]:
 
     A few whose rays do not meet are placed on a ray, as far away as points are: the mismatches are found later.
     """
-    points = {**block.rough, **intersected(block, 0.0)}
+    points = {**block.rough, **intersect_points(block, 0.0)}
     nowhere = np.isnan(np.array(list(points.values())).reshape(-1, 3)).any(axis=1)
     unknown = {name for name, is_nowhere in zip(points, nowhere, strict=True) if is_nowhere}
     found = {name: xyz for name, xyz in points.items() if name not in unknown}
@@ -410,7 +410,7 @@ def joined_frame(network: Network, parts: Sequence[Image]) -> tuple[dict[str, Fi
         rows = np.flatnonzero(network.image_numbers == network.images.index(part))
         by_mark = {(observations.kind[row], observations.point[row]): network.straight_xy_mm[row] for row in rows}
         marks_by_part[part.name] = {mark: by_mark[mark] for mark in sorted(by_mark)}
-    first_from, place = _placed(parts[0].part_of, marks_by_part)
+    first_from, place = _placed_points(parts[0].part_of, marks_by_part)
     given = network.camera_by_name[parts[0].camera].fiducials
     marks = sorted(point for kind, point in place if kind == "fiducial")
     camera_mm = np.array([[given[mark].x_mm.value, given[mark].y_mm.value] for mark in marks]).reshape(-1, 2)
@@ -430,7 +430,7 @@ def joined_frame(network: Network, parts: Sequence[Image]) -> tuple[dict[str, Fi
     return films, {point: xy for (point, _), xy in zip(joins, in_camera, strict=True)}
 
 
-def _placed(
+def _placed_points(
     frame: str, marks_by_part: Mapping[str, Mapping[Mark, Array]]
 ) -> tuple[dict[str, FilmFit], dict[Mark, Array]]:
     """Place the parts in the comparator system of the first; the part with most common points comes next."""

@@ -32,7 +32,7 @@ class _Normalised:
     axes: Array
 
     @classmethod
-    def of(cls, places: Array, present: Mask) -> "_Normalised":
+    def normalise(cls, places: Array, present: Mask) -> "_Normalised":
         is_there = present[..., None]
         origin = (places * is_there).sum(axis=1) / present.sum(axis=1)[:, None]
         centred = (places - origin[:, None]) * is_there
@@ -78,7 +78,7 @@ class LinearTransformations:
 def linear_transformations(xyz: Array, xy_mm: Array, present: Mask | None = None) -> LinearTransformations:
     """Transformations of points (m, n, 3) to images (m, n, 2) with the least algebraic residuals."""
     present = np.ones(xyz.shape[:2], dtype=bool) if present is None else present
-    field, image = _Normalised.of(xyz, present), _Normalised.of(xy_mm, present)
+    field, image = _Normalised.normalise(xyz, present), _Normalised.normalise(xy_mm, present)
     is_flat, coefficients = field.extents[:, -1] < FLAT_FIELD * field.extents[:, 0], np.zeros((len(xyz), 3, 4))
     for flat in np.unique(is_flat):
         own = is_flat == flat
@@ -103,7 +103,10 @@ def equations_by_point(xyz: Array, xy_mm: Array, present: Mask) -> Callable[[Ind
 
     These are (m, n, 2, 3 w), 0 where absent; their coefficients (3, w) are those of the transformation.
     """
-    field, image = _Normalised.of(xyz[None], np.ones((1, len(xyz)), dtype=bool)), _Normalised.of(xy_mm, present)
+    field, image = (
+        _Normalised.normalise(xyz[None], np.ones((1, len(xyz)), dtype=bool)),
+        _Normalised.normalise(xy_mm, present),
+    )
     is_flat = field.extents[0, -1] < FLAT_FIELD * field.extents[0, 0]
     at = np.hstack([field.places[0] @ (field.axes[0, :, :2] if is_flat else np.eye(3)), np.ones((len(xyz), 1))])
 

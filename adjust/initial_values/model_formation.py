@@ -174,9 +174,9 @@ def absolute_orientation(model: Array, known: Array, stations: Array) -> Similar
     given = ~np.isnan(known)
     if given.sum() < 7 or not given.any(axis=0).all():
         return None
-    target = _centred(known, given)
+    target = _centre_model(known, given)
     if (given.all(axis=1) == given.any(axis=1)).all():
-        u, strength, vt = np.linalg.svd(target.T @ _centred(model, given))
+        u, strength, vt = np.linalg.svd(target.T @ _centre_model(model, given))
         proper = np.array([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)])
         is_determined = proper[1:] @ strength[1:] > SINGULAR**2 * strength[0]  # False for points on a line
         return _similarity((u * proper) @ vt, model, known, given) if is_determined else None
@@ -203,7 +203,7 @@ def absolute_orientation(model: Array, known: Array, stations: Array) -> Similar
     )
 
 
-def levelled(model: Array, heights: Array, stations: Array, principal_distance_mm: float) -> Similarity | None:
+def level_model(model: Array, heights: Array, stations: Array, principal_distance_mm: float) -> Similarity | None:
     """Level and scale a model by heights alone, robustly; origin and azimuth of X and Y are arbitrary.
 
     Parameters
@@ -240,7 +240,7 @@ def levelled(model: Array, heights: Array, stations: Array, principal_distance_m
     return Similarity(scale, rotation, np.array([0.0, 0.0, height]) - scale * rotation @ middle)
 
 
-def _centred(xyz: Array, given: Mask) -> Array:
+def _centre_model(xyz: Array, given: Mask) -> Array:
     """Coordinates reduced by the mean of the given ones, axis by axis; 0 where not given."""
     mean = np.where(given, xyz, 0.0).sum(axis=0) / given.sum(axis=0)
     return np.where(given, xyz - mean, 0.0)
@@ -248,7 +248,7 @@ def _centred(xyz: Array, given: Mask) -> Array:
 
 def _misfit(rotation: Array, model: Array, target: Array, given: Mask) -> Array:
     """Residuals of the given coordinates with this rotation and the best scale and shift."""
-    turned = _centred(model @ rotation.T, given)
+    turned = _centre_model(model @ rotation.T, given)
     return np.asarray((_scale(turned, target) * turned - target)[given])
 
 
@@ -259,7 +259,7 @@ def _scale(turned: Array, target: Array) -> float:
 
 def _similarity(rotation: Array, model: Array, known: Array, given: Mask) -> Similarity:
     turned = model @ rotation.T
-    scale = _scale(_centred(turned, given), _centred(known, given))
+    scale = _scale(_centre_model(turned, given), _centre_model(known, given))
     return Similarity(scale, rotation, np.nanmean(np.where(given, known - scale * turned, np.nan), axis=0))
 
 
@@ -277,17 +277,17 @@ class BlockState:
 def extend(block: BlockState) -> None:
     """Resect images and intersect points in turn until no more can be oriented; images with most control first."""
     while True:
-        block.points = intersected(block, WELL_DETERMINED)
+        block.points = intersect_points(block, WELL_DETERMINED)
         waiting = [name for name in sorted(block.sights) if name not in block.poses]
         new: dict[str, Pose] = {}
         for fewest in (SURE_RESECTION, 4, 3) if waiting else ():
-            new = new or _resected(block, waiting, fewest)
+            new = new or _resect_stations(block, waiting, fewest)
         if not new:
             return
         block.poses.update(new)
 
 
-def _resected(block: BlockState, images: Sequence[str], fewest: int) -> dict[str, Pose]:
+def _resect_stations(block: BlockState, images: Sequence[str], fewest: int) -> dict[str, Pose]:
     """Resect the images that have enough points: from firm points, else from all points with coordinates so far."""
     poses: dict[str, Pose] = {}
     for coordinates in (block.firm, {**block.rough, **block.points}):
@@ -305,7 +305,7 @@ def known_field(sight: Sight, coordinates: Mapping[str, Array]) -> KnownField:
     return KnownField(xyz[usable], sight.xy_mm[usable], sight.sigma_mm)
 
 
-def intersected(block: BlockState, weakest: float) -> dict[str, Array]:
+def intersect_points(block: BlockState, weakest: float) -> dict[str, Array]:
     """Intersect the points that are not fully known, with given coordinates fixed.
 
     Returns coordinates (3,) by point, of those with a determination above `weakest`.
@@ -361,7 +361,7 @@ def orient_free_model(sights: Mapping[str, Sight], known: Mapping[str, Array]) -
     with_height = ~np.isnan(xyz[:, 2])
     if np.isnan(xyz[:, :2]).all() and with_height.sum() > FEWEST_SHARED:
         distance = min(sight.principal_distance_mm for sight in sights.values())
-        similarity = levelled(model[with_height], xyz[with_height, 2], stations, distance)
+        similarity = level_model(model[with_height], xyz[with_height, 2], stations, distance)
     else:
         similarity = absolute_orientation(model, xyz, stations)
     if similarity is None:

@@ -84,7 +84,7 @@ def refined_poses(
         diagonal = np.einsum("kii->ki", normal)
         diagonal += damping[going, None] * diagonal + 1e-14  # the constant avoids singular matrices
         step = np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], dtype=np.float64)
-        moved = _stepped(rotations[going], shifts[going], step)
+        moved = _step_poses(rotations[going], shifts[going], step)
         new_cost = (weights[going] * squared_residuals(*moved, *fields)).sum(axis=1)
         better, moves = new_cost < cost[going], np.abs(cost[going] - new_cost) > SETTLED * cost[going]
         taken = going[better]
@@ -137,7 +137,7 @@ def refined_distance(
         reduced = normal[:, 6:, 6:].sum(axis=0) - left[:, :2] + np.diag(prior)
         change = np.linalg.solve(reduced, right[:, 6:].sum(axis=0) - left[:, 2] - prior * [0.0, bend])
         change = np.clip(change, -LARGEST_CHANGE, LARGEST_CHANGE)
-        rotations, shifts = _stepped(rotations, shifts, through[..., 2] - through[..., :2] @ change)
+        rotations, shifts = _step_poses(rotations, shifts, through[..., 2] - through[..., :2] @ change)
         c, bend = c * float(np.exp(change[0])), bend + float(change[1])
         if is_settled := bool(abs(change[0]) < np.sqrt(SETTLED)):
             break
@@ -158,7 +158,7 @@ def squared_residuals(rotations: Array, shifts: Array, points: Array, tangents: 
     return np.asarray(np.where(in_front & (squared < BEHIND), squared, BEHIND))
 
 
-def _stepped(rotations: Array, shifts: Array, step: Array) -> tuple[Array, Array]:
+def _step_poses(rotations: Array, shifts: Array, step: Array) -> tuple[Array, Array]:
     turn = rotation_from_vector(step[:, :3])
     return turn @ rotations, np.einsum("kij,kj->ki", turn, shifts) + step[:, 3:]
 

@@ -112,7 +112,7 @@ def resect(xyz: Array, xy_mm: Array, principal_distance_mm: float, floor_mm: flo
     -------
     The pose that fits most points; None where the points do not determine one (collinear, for example).
     """
-    return _resected([KnownField(xyz, xy_mm, floor_mm)], np.array([principal_distance_mm]), THOROUGH)[0]
+    return _resect_fields([KnownField(xyz, xy_mm, floor_mm)], np.array([principal_distance_mm]), THOROUGH)[0]
 
 
 def resections(
@@ -138,10 +138,10 @@ def resections(
     c = np.array(principal_distances_mm, dtype=np.float64)
     if found is None:
         quick = [i for i, field in enumerate(fields) if len(field.xyz) >= FEWEST_QUICK]
-        of_quick = dict(zip(quick, _resected([fields[i] for i in quick], c[quick], QUICK), strict=True))
+        of_quick = dict(zip(quick, _resect_fields([fields[i] for i in quick], c[quick], QUICK), strict=True))
         found = [of_quick.get(i) for i in range(len(fields))]
     result, again = list(found), _disagreeing(fields, c, found)
-    for i, each in zip(again, _resected([fields[i] for i in again], c[again], THOROUGH), strict=True):
+    for i, each in zip(again, _resect_fields([fields[i] for i in again], c[again], THOROUGH), strict=True):
         result[i] = each
     return result
 
@@ -182,8 +182,8 @@ def trial_misfits(fields: Sequence[KnownField], principal_distances_mm: Array) -
 def three_point_poses(xyz: Array, xy_mm: Array, principal_distance_mm: float) -> list[Pose]:
     """All exact poses (up to four) for three points, xyz (3, 3), observed at xy_mm (3, 2)."""
     field = _Fields.from_fields([KnownField(xyz, xy_mm, 0.0)], np.array([principal_distance_mm]))
-    rotations, shifts, of = triple_poses(field.points, field.tangents)
-    points, tangents = field.points[of], field.tangents[of]
+    rotations, shifts, triple = triple_poses(field.points, field.tangents)
+    points, tangents = field.points[triple], field.tangents[triple]
     rotations, shifts = refined_poses(rotations, shifts, points, tangents, np.ones(points.shape[:2]))
     exact = squared_residuals(rotations, shifts, points, tangents).max(axis=1) < EXACT
     poses: list[Pose] = []
@@ -214,7 +214,7 @@ def distance_together(
     shifts = -np.einsum("kij,kj->ki", rotations, centers)
     inliers = np.zeros_like(batch.present)
     inliers[batch.present] = np.concatenate([each.inliers for each in known])
-    together = _refined_together(batch, rotations, shifts, inliers)
+    together = _refine_jointly(batch, rotations, shifts, inliers)
     if together is None:
         return None
     c, spread, refined = together
@@ -236,14 +236,14 @@ def distance_directly(fields: Sequence[KnownField]) -> tuple[float, float, list[
         return None
     c, rotations, shifts = start
     batch = replace(batch, tangents=batch.tangents / c, c=np.full(len(fields), c), floor=batch.floor / c)
-    together = _refined_together(batch, rotations, shifts, batch.present)
+    together = _refine_jointly(batch, rotations, shifts, batch.present)
     if together is None or _disagreeing(fields, np.full(len(fields), together[0]), together[2]):
         return None
     inlier_share = np.concatenate([each.inliers for each in together[2]]).mean()
     return together if inlier_share > SOUND and together[1] < CLEAR_SIGMA else None
 
 
-def _refined_together(
+def _refine_jointly(
     batch: "_Fields", rotations: Array, shifts: Array, inliers: Mask
 ) -> tuple[float, float, list[Resection]] | None:
     """Principal distance, standard deviation of its logarithm and resections by least squares; None without them."""
@@ -346,9 +346,9 @@ class _Fields:
             triples = np.take_along_axis(drawn, np.argsort(slender, axis=1, kind="stable")[:, :most, None], axis=1)
         image = np.repeat(np.arange(len(triples)), triples.shape[1])
         at = image[:, None], triples.reshape(-1, 3)
-        rotations, shifts, of = triple_poses(self.points[at], self.tangents[at])
-        best = self.best(rotations, shifts, image[of], effort.refined)
-        return rotations[best], shifts[best], image[of][best]
+        rotations, shifts, triple = triple_poses(self.points[at], self.tangents[at])
+        best = self.best(rotations, shifts, image[triple], effort.refined)
+        return rotations[best], shifts[best], image[triple][best]
 
     def best(self, rotations: Array, shifts: Array, image: Indices, most: int) -> Indices:
         """Indices of each image's poses with the least trimmed squares, at most `most`."""
@@ -384,7 +384,7 @@ def _best_poses(
         yield some, batch, rotations[best], shifts[best], image[best]
 
 
-def _resected(fields: Sequence[KnownField], c: Array, effort: Effort) -> list[Resection | None]:
+def _resect_fields(fields: Sequence[KnownField], c: Array, effort: Effort) -> list[Resection | None]:
     """Resect all fields, of at least four points each, with the same effort."""
     found: list[Resection | None] = [None] * len(fields)
     for some, batch, rotations, shifts, image in _best_poses(fields, c, effort):

@@ -19,10 +19,9 @@ from adjust.linear_algebra.factor import Blocks
 from adjust.linear_algebra.fronts import Fronts, band_order, make_fronts
 from adjust.linear_algebra.normal_equations import SparseRows, SparsityPattern
 from adjust.linear_algebra.small_matrices import applied, inverse, lower_root, product
+from adjust.linear_algebra.sparse_factor import ELEMENTS_AT_ONCE
 from adjust.problem.condition_equations import Derivatives
 from adjust.problem.problem import ABSENT, Problem, State, side_by_side
-
-ELEMENTS_AT_ONCE = 2_000_000  # matrix elements of the blocks in one batch
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ class Numbering:
     @cached_property
     def touched(self) -> list[Touched]:
         """Unknowns of all blocks, blocks of equal shape together."""
-        return list(_arranged(self.numbers[self.problem.columns], self._blocks, self.numbers))
+        return list(_arrange_blocks(self.numbers[self.problem.columns], self._blocks, self.numbers))
 
     @cached_property
     def numbers(self) -> Indices:
@@ -98,7 +97,8 @@ class Numbering:
             return None
         owning, grouped = (points, images) if points_own else (images, points)
         own, members = (
-            np.pad(self.numbers[of], ((0, 1), (0, 0)), constant_values=ABSENT) for _, of, _ in (owning, grouped)
+            np.pad(self.numbers[positions], ((0, 1), (0, 0)), constant_values=ABSENT)
+            for _, positions, _ in (owning, grouped)
         )
         own[own < shared_count] = ABSENT
         members[members >= shared_count] = ABSENT
@@ -154,7 +154,7 @@ class Numbering:
         groups = [
             self.problem.network.observed_frames if self._blocks.are_points else group_of[self.problem.places[:, 0]]
         ]
-        blocks = [self._blocks.of]
+        blocks = [self._blocks.block_numbers]
         for i, further in enumerate(self.problem.further):
             groups.append(group_of[further.positions])
             blocks.append(np.full(len(further.positions), len(self._blocks.owned) + i))
@@ -197,27 +197,28 @@ class Numbering:
 
 @dataclass(frozen=True)
 class _Blocks:
-    """Blocks. owned (b, k): positions of their own unknowns, padded with ABSENT; of (n,): block of each observation."""
+    """Blocks. owned (b, k): positions of their own unknowns, padded with ABSENT; block_numbers (n,):
+    block of each observation."""
 
     owned: Indices
-    of: Indices
+    block_numbers: Indices
     are_points: bool  # or frames
 
 
-def _arranged(derivatives: Indices, blocks: _Blocks, numbers: Indices) -> Iterator[Touched]:
+def _arrange_blocks(derivatives: Indices, blocks: _Blocks, numbers: Indices) -> Iterator[Touched]:
     """Group blocks by shape."""
     # derivatives (n, k): numbers of the unknowns of each derivative; numbers: number of each unknown by position.
     owned = numbers[blocks.owned]
     count, owns = int(numbers.max(initial=ABSENT)) + 1, owned != ABSENT
     first_own = count - int(owns.sum())
     rank = (np.arange(count + 1) - first_own) % max(count, 1)  # own unknowns first; the last stands for ABSENT
-    order = np.argsort(blocks.of, kind="stable")
+    order = np.argsort(blocks.block_numbers, kind="stable")
     # Most observations involve the same unknowns as the one before: process such runs once.
-    of, unknown = blocks.of[order], derivatives[order]
-    begins = np.append(True, (of[1:] != of[:-1]) | (unknown[1:] != unknown[:-1]).any(axis=1))[: len(of)]
-    run, of, unknown = np.cumsum(begins) - 1, of[begins], unknown[begins].T
+    block, unknown = blocks.block_numbers[order], derivatives[order]
+    begins = np.append(True, (block[1:] != block[:-1]) | (unknown[1:] != unknown[:-1]).any(axis=1))[: len(block)]
+    run, block, unknown = np.cumsum(begins) - 1, block[begins], unknown[begins].T
     # All pairs of a block and an unknown that it involves or owns: block by block, own unknowns first.
-    pair = np.where(unknown == ABSENT, ABSENT, of * count + rank[unknown])
+    pair = np.where(unknown == ABSENT, ABSENT, block * count + rank[unknown])
     new = pair != ABSENT
     new[:, 1:] &= pair[:, 1:] != pair[:, :-1]
     owned_pairs = np.nonzero(owns)[0] * count + rank[owned[owns]]
@@ -226,10 +227,10 @@ def _arranged(derivatives: Indices, blocks: _Blocks, numbers: Indices) -> Iterat
     widths = np.diff(first, append=len(pairs))
     own_counts = owns.sum(axis=1)
     touched = place[np.maximum(np.cumsum(new).reshape(new.shape) - 1, 0)]
-    columns = np.where(pair == ABSENT, widths[of], touched - first[of]).T  # after the last for absent ones
+    columns = np.where(pair == ABSENT, widths[block], touched - first[block]).T  # after the last for absent ones
     unknown = (pairs % count + first_own) % count
 
-    heights = np.bincount(blocks.of, minlength=len(owned))
+    heights = np.bincount(blocks.block_numbers, minlength=len(owned))
     first_row = np.cumsum(heights) - heights
     shapes, kinds = np.unique(np.stack([heights, own_counts, widths], axis=1), axis=0, return_inverse=True)
     for kind, (height, own_count, width) in enumerate(shapes):
@@ -273,7 +274,7 @@ class WhitenedRows:
 
     def replace_discrepancies(self, by_observation: Array, v_mm: Array) -> "WhitenedRows":
         """Replace the right side by that of other discrepancies v (n, 2); by_observation: A (n, 2, 2)."""
-        return replace(self, right=_whitened(self.root, applied(by_observation, v_mm)[..., None])[..., 0])
+        return replace(self, right=_whiten(self.root, applied(by_observation, v_mm)[..., None])[..., 0])
 
     def change_mm(self, by_observation: Array, step: Array) -> Array:
         """First-order change -A^-1 B dx of the computed observations (n, 2) by a step dx of the unknowns."""
@@ -288,9 +289,9 @@ class WhitenedRows:
         if pattern is None:
             return None
         itself = replace(self)  # a copy avoids a reference cycle, so that the memory is freed before the next step
-        return SparseRows(pattern, self.matrix, self.right, self.further, itself._arranged)
+        return SparseRows(pattern, self.matrix, self.right, self.further, itself._arrange_blocks)
 
-    def _arranged(self) -> Iterator[tuple[Indices, Blocks]]:
+    def _arrange_blocks(self) -> Iterator[tuple[Indices, Blocks]]:
         nothing = np.empty((1, 0), dtype=np.intp)
         rows = [touched.rows for touched in self.numbering.touched] + [nothing] * len(self.further)
         return zip(rows, self, strict=True)
@@ -318,11 +319,11 @@ def whitened_rows(
         compiled.kernels.whiten_rows(a, covariance_mm2, v_mm, root, matrix, right)
         return WhitenedRows(numbering, root, matrix, right, tuple(further))
     root = lower_root(product(product(a, covariance_mm2), a.transpose(0, 2, 1)))
-    right = _whitened(root, applied(a, v_mm)[..., None])[..., 0]
-    return WhitenedRows(numbering, root, _whitened(root, matrix), right, tuple(further))
+    right = _whiten(root, applied(a, v_mm)[..., None])[..., 0]
+    return WhitenedRows(numbering, root, _whiten(root, matrix), right, tuple(further))
 
 
-def _whitened(root: Array, rows: Array) -> Array:
+def _whiten(root: Array, rows: Array) -> Array:
     """Multiply rows (n, 2, k) by the inverses of lower triangles (n, 2, 2), in place to save memory."""
     rows[:, 0] /= root[:, 0, :1]
     rows[:, 1] -= root[:, 1, :1] * rows[:, 0]

@@ -105,8 +105,8 @@ def factorise(numbering: Numbering, at: Linearised, damping: float = 0.0, camera
     """Factorise the normal equations, with or without the priors of the cameras (F5 to F9) and scanners."""
     weights = prior_root_weights(numbering)
     if not camera_priors:
-        of = numbering.problem.unknowns
-        positions = [*of.camera.values(), *of.fiducial.values(), *of.scanner.values()]
+        unknowns = numbering.problem.unknowns
+        positions = [*unknowns.camera.values(), *unknowns.fiducial.values(), *unknowns.scanner.values()]
         weights = np.where(np.isin(numbering.free, np.concatenate(positions)), 0.0, weights)
     differences = prior_differences(numbering.problem, at.state)[numbering.free]
     system = len(numbering.free), weights, weights * differences
@@ -134,9 +134,9 @@ def iterate(
     -----
     A step is accepted if it decreases v'Pv. Otherwise, or if a point would have no image after it, the damping is
     increased. The gain, the ratio of the actual to the predicted decrease, determines the next damping (Nielsen 1999,
-    Damping parameter in Marquardt's method). Damped steps are corrected to the second order (`_bent`), to follow curved
-    valleys in which the principal distance is correlated with heights and scale. Undamped steps that shrink slowly are
-    accelerated (`_accelerated`).
+    Damping parameter in Marquardt's method). Damped steps are corrected to the second order
+    (`_second_order_step`), to follow curved valleys in which the principal distance is correlated with heights and
+    scale. Undamped steps that shrink slowly are accelerated (`_accelerate`).
     """
     at = linearise(numbering, covariance_mm2, state)
     if at is None:
@@ -217,7 +217,7 @@ def _step(
     problem = numbering.problem
     attempts = 0
     if damping == 0.0 and before is not None and before.damping == 0.0:
-        accelerated = _accelerated(numbering, covariance_mm2, at, before)
+        accelerated = _accelerate(numbering, covariance_mm2, at, before)
         if accelerated is not None:
             return accelerated
     while damping < LARGEST_DAMPING:
@@ -233,7 +233,7 @@ def _step(
         if np.isfinite(step).all():
             # Predicted decrease of v'Pv: factor.length() belongs to the damped equations, so add the damping term.
             promised = factor.length() ** 2 + damping * float(((factor.scale * solution) ** 2).sum())
-            bent = step if damping == 0.0 else _bent(numbering, at, damping, step)
+            bent = step if damping == 0.0 else _second_order_step(numbering, at, damping, step)
             moved = None if bent is None else linearise(numbering, covariance_mm2, problem.step_state(at.state, bent))
             is_rounding = damping == 0.0 and factor.length() < ROUNDING_SIGMAS  # and so is the change of v'Pv
             is_better = moved is not None and (is_rounding or moved.vpv <= at.vpv + VPV_ROUNDING * (1.0 + at.vpv))
@@ -244,7 +244,7 @@ def _step(
     return None
 
 
-def _accelerated(numbering: Numbering, covariance_mm2: Array, at: Linearised, before: _Moved) -> _Moved | None:
+def _accelerate(numbering: Numbering, covariance_mm2: Array, at: Linearised, before: _Moved) -> _Moved | None:
     """Accelerate an undamped step by the one before; None if that is not possible or no better."""
     # In weakly determined directions, the second derivatives neglected with large residuals make Gauss-Newton steps
     # shrink slowly, or overshoot. The combination of the last two steps of least length replaces the step (Anderson
@@ -265,7 +265,7 @@ def _accelerated(numbering: Numbering, covariance_mm2: Array, at: Linearised, be
     return _Moved(moved, length, 0.0, 1.0, 1, step, taken)
 
 
-def _bent(numbering: Numbering, at: Linearised, damping: float, step: Array) -> Array | None:
+def _second_order_step(numbering: Numbering, at: Linearised, damping: float, step: Array) -> Array | None:
     """Add the second-order correction to a damped step; None if it is too large or cannot be computed."""
     # Geodesic acceleration (Transtrum and Sethna 2012, Improvements to the Levenberg-Marquardt algorithm): the second
     # derivative of the observations along the step, by a difference quotient, is added to the discrepancies.

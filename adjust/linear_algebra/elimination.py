@@ -28,18 +28,18 @@ from adjust.linear_algebra.factor import BlockFactors, Blocks, DenseBlocks, Fact
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.normal_equations import SharedEquations, SparseRows, SparsityPattern, batches, take_columns
 from adjust.linear_algebra.sparse_factor import (
+    SAFE,
     TEN_DIGITS,
     Triangle,
     factorise_normal_equations,
     qr_triangle,
-    reflected,
+    reflect_fronts,
     reflections_cost,
 )
 
 COMPILED_OWN = 3  # largest number of own unknowns per block in kernels.c
 CHEAP = 1e7  # rows times columns squared of the shared unknowns, up to which Householder QR is always used
 REFLECTED = 1e9  # the same, up to which it is used where normal equations would lose digits
-SAFE = 1e-6  # reciprocal condition of the shared triangle down to which normal equations suffice beyond that
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Border:
         return csr_array(coo_array((data[there], (rows[there], columns[there])), shape=shape))
 
 
-def eliminated(
+def eliminate_blocks(
     rows: SparseRows, root_weight: Array, prior_right: Array, scale: Array, equations: SharedEquations
 ) -> "SparseBlocks":
     """Eliminate all own unknowns.
@@ -125,16 +125,16 @@ def _eliminate(blocks: "SparseBlocks", weight: Array, prior: Array) -> None:
     alone = np.empty((*own.shape, len(pattern.singles) + 1))
     for members in batches(pattern.first):
         some = slice(pattern.first[members.start], pattern.first[members.stop])
-        order, of = pattern.order[some], pattern.block_numbers[some] - members.start
+        order, block = pattern.order[some], pattern.block_numbers[some] - members.start
         by_block = csr_array(
-            (np.ones(len(of)), np.arange(len(of)), pattern.first[members.start : members.stop + 1] - some.start),
-            shape=(members.stop - members.start, len(of)),
+            (np.ones(len(block)), np.arange(len(block)), pattern.first[members.start : members.stop + 1] - some.start),
+            shape=(members.stop - members.start, len(block)),
         )
         by_own, by_group, by_single = (take_columns(rows.matrix, columns, order) for columns in pattern.columns)
-        by_own.swapaxes(1, 2)[(own[members][of] < 0).T] = 0.0
+        by_own.swapaxes(1, 2)[(own[members][block] < 0).T] = 0.0
         by_prior = weight[members].T[..., None] * np.eye(own.shape[1])[:, None, :]
-        first = _orthonormal(by_block, of, by_own, by_prior)
-        blocks.triangle[members] = _orthonormal(by_block, of, by_own, by_prior) @ first
+        first = _orthonormal(by_block, block, by_own, by_prior)
+        blocks.triangle[members] = _orthonormal(by_block, block, by_own, by_prior) @ first
         x, y = rows.right[order].T
         reduced = by_block @ (by_own[:, 0] * x + by_own[:, 1] * y).T
         blocks.right[members] = reduced + (by_prior * prior[members]).sum(axis=2).T
@@ -149,9 +149,9 @@ def _eliminate(blocks: "SparseBlocks", weight: Array, prior: Array) -> None:
     blocks.alone[...] = alone[..., :-1]
 
 
-def _orthonormal(by_block: csr_array, of: Indices, columns: Array, by_prior: Array) -> Array:
+def _orthonormal(by_block: csr_array, block: Indices, columns: Array, by_prior: Array) -> Array:
     """Orthonormalise columns (o, 2, m), with rows (o, b, o) of priors below, in place by modified Gram-Schmidt."""
-    # by_block (b, m): sums over the blocks; of (m,): block of each pair. Returns the triangles (b, o, o).
+    # by_block (b, m): sums over the blocks; block (m,): of each pair. Returns the triangles (b, o, o).
     count = len(columns)
     triangle = np.zeros((by_prior.shape[1], count, count))
     for i in range(count):
@@ -159,11 +159,11 @@ def _orthonormal(by_block: csr_array, of: Indices, columns: Array, by_prior: Arr
         along += (by_prior[i] * by_prior[i:]).sum(axis=2).T
         length = np.sqrt(along[:, 0])
         over = 1.0 / np.where(length > 0.0, length, np.inf)
-        columns[i] *= over[of]
+        columns[i] *= over[block]
         by_prior[i] *= over[:, None]
         triangle[:, i, i:] = along * over[:, None]
         rest = triangle[:, i, i + 1 :].T
-        columns[i + 1 :] -= rest.take(of, axis=1)[:, None] * columns[i]
+        columns[i + 1 :] -= rest.take(block, axis=1)[:, None] * columns[i]
         by_prior[i + 1 :] -= rest[..., None] * by_prior[i]
     return triangle
 
@@ -357,7 +357,7 @@ def _reflect_all(blocks: Iterable[Blocks], scale: Array, priors: tuple[Array, Ar
         factors.append(BlockFactors(block.own, block.shared, *of_own))
         rests.append((block.shared, reduced[:, own_count:, own_count:]))
     fronts = fronts or Fronts.single(len(scale) - sum(block.own.size for block in factors))
-    triangle, right = reflected(fronts, rests, *(prior[: fronts.count] for prior in priors))
+    triangle, right = reflect_fronts(fronts, rests, *(prior[: fronts.count] for prior in priors))
     return Factor(DenseBlocks(tuple(factors)), triangle, right, scale)
 
 
@@ -368,7 +368,7 @@ def _eliminate_normally(
     # lift: its square is added to the diagonal of the scaled normal equations.
     fronts, squares = equations.fronts, equations.squares
     root_weight, prior_right = (prior[: fronts.count] for prior in priors)
-    blocks = eliminated(rows, *priors, scale, equations)
+    blocks = eliminate_blocks(rows, *priors, scale, equations)
     over = 1.0 / scale[: fronts.count]
     for front, square in zip(fronts, squares, strict=True):
         square *= over[front.columns]

@@ -80,9 +80,9 @@ def determinant(matrix: Array) -> Array:
     return np.asarray(matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0])
 
 
-def solved(matrix: Array, right: Array, regular: Mask, of: Array) -> Array:
-    """Solve 2x2 systems with known determinants `of` (n,); the result is meaningless where not regular."""
-    divisor = np.where(regular, of, 1.0)
+def solve_pairs(matrix: Array, right: Array, regular: Mask, det: Array) -> Array:
+    """Solve 2x2 systems with known determinants det (n,); the result is meaningless where not regular."""
+    divisor = np.where(regular, det, 1.0)
     x, y = right[..., 0], right[..., 1]
     first = (matrix[..., 1, 1] * x - matrix[..., 0, 1] * y) / divisor
     second = (matrix[..., 0, 0] * y - matrix[..., 1, 0] * x) / divisor
@@ -103,7 +103,7 @@ def newton(
             value, gradient = misclosure(xy)
             side = determinant(gradient)
             regular = np.isfinite(side) & (side > 0.0)
-            step = solved(gradient, value, regular, side)
+            step = solve_pairs(gradient, value, regular, side)
             xy = xy - step
             found = regular & (np.abs(step).max(axis=1) <= tolerance(xy))
             if found.all():
@@ -114,8 +114,8 @@ def newton(
 def inverse(matrix: Array) -> Array:
     """Inverses of regular 2x2 matrices (n, 2, 2)."""
     (a, b), (c, d) = matrix[..., 0, :].T, matrix[..., 1, :].T
-    of = determinant(matrix)
-    return matrices((d / of, -b / of), (-c / of, a / of))
+    det = determinant(matrix)
+    return matrices((d / det, -b / det), (-c / det, a / det))
 
 
 def lower_root(matrix: Array) -> Array:

@@ -55,14 +55,14 @@ class Triangle:
         """Solve R x = b for right sides b (s,) or (s, d). Raises numpy.linalg.LinAlgError if R is singular."""
         result = np.array(right, dtype=np.float64)
         for front, own, border in reversed(list(self.parts)):
-            result[front.own] = _solved(own, result[front.own] - border @ result[front.after])
+            result[front.own] = _solve_fronts(own, result[front.own] - border @ result[front.after])
         return result
 
     def solve_transposed(self, right: Array) -> Array:
         """Solve R' x = b for right sides b (s,) or (s, d)."""
         result = np.array(right, dtype=np.float64)
         for front, own, border in self.parts:
-            result[front.own] = _solved(own, result[front.own], transposed=True)
+            result[front.own] = _solve_fronts(own, result[front.own], transposed=True)
             result[front.after] -= border.T @ result[front.own]
         return result
 
@@ -228,7 +228,7 @@ class Triangle:
         return self.squares[i].take(places[:, :, None] * width + places[:, None, :])
 
 
-def _solved(triangle: Array, right: Array, transposed: bool = False) -> Array:
+def _solve_fronts(triangle: Array, right: Array, transposed: bool = False) -> Array:
     """Solve an upper triangular system, or its transpose, without SciPy's further checks."""
     if not len(triangle):
         return right
@@ -241,7 +241,7 @@ def _solved(triangle: Array, right: Array, transposed: bool = False) -> Array:
 Rows = tuple[Indices, Array]  # unknowns (b, s) and rows (b, k, s + 1) in them, the right side last
 
 
-def reflected(
+def reflect_fronts(
     fronts: Fronts, rows: Iterable[Rows], prior_root_weight: Array, prior_right: Array
 ) -> tuple[Triangle, Array]:
     """Factorise rows, and one prior row per unknown, by Householder QR; returns the triangle and right side (s,).
@@ -267,7 +267,7 @@ def reflected(
         prior = np.zeros((front.count, front.width + 1))
         prior[:, : front.count] = np.diag(prior_root_weight[front.own])
         prior[:, -1] = prior_right[front.own]
-        triangle = _condensed(local, prior)
+        triangle = _condense(local, prior)
         of_this.clear()
         own.append(triangle[: front.count, : front.count])
         borders.append(triangle[: front.count, front.count : -1])
@@ -283,7 +283,7 @@ def append_rows(triangle: Triangle, rows: Iterable[tuple[Indices, Array]]) -> Tr
     itself = [(front.columns, np.hstack(parts)) for front, *parts in triangle.parts]
     all_rows = [(unknowns[None], np.pad(each, ((0, 0), (0, 1)))[None]) for unknowns, each in (*itself, *rows)]
     nothing = np.zeros(len(triangle))
-    return reflected(triangle.fronts, all_rows, nothing, nothing)[0]
+    return reflect_fronts(triangle.fronts, all_rows, nothing, nothing)[0]
 
 
 def factorise_normal_equations(fronts: Fronts, squares: list[Array], right: Array) -> tuple[Triangle, Array]:
@@ -331,7 +331,7 @@ def reflections_cost(fronts: Fronts, first: Indices, heights: Indices) -> float:
     return float((of_front * np.array([front.width for front in fronts]) ** 2).sum())
 
 
-def _condensed(rows: Sequence[Rows], priors: Array) -> Array:
+def _condense(rows: Sequence[Rows], priors: Array) -> Array:
     """Triangle (up to w + 1, w + 1) of prior rows (p, w + 1) and of rows in some of the w unknowns."""
     width = priors.shape[1] - 1
     together = max(CONDENSED_ROWS, ROWS_PER_COLUMN * (width + 1))

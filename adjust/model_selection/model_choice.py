@@ -217,12 +217,12 @@ def choose(
     with_sets = all(camera.name in half_mm for camera in own.network.cameras)
     # Distortion, scanner terms and transformation are selected in turn until none changes. The scanner terms come
     # before the transformation, since a richer transformation could absorb them.
-    film, bends, untold = given.transformation, Bends(), tuple[str, ...]()
+    film, bends, bend_remarks = given.transformation, Bends(), tuple[str, ...]()
     for _ in range(ROUNDS):
         chosen = fits.simplest(replace(each, bends=bends) for each in lenses(fits.network, film, with_sets))
         if chosen is None:
             break
-        needed, untold = fits.needed_bends(replace(chosen.model, bends=()))
+        needed, bend_remarks = fits.needed_bends(replace(chosen.model, bends=()))
         possible = dict.fromkeys(((), needed, remaining_bends(film, given.bends)))
         bent = fits.simplest(replace(chosen.model, bends=each) for each in possible)
         chosen = bent and fits.simplest(
@@ -233,7 +233,7 @@ def choose(
             break
         film, bends = chosen.model.transformation, chosen.model.bends
     candidates = tuple(fits.done.values())
-    sentences = (*reasons(candidates, chosen), *untold)
+    sentences = (*reasons(candidates, chosen), *bend_remarks)
     return Choice(given, candidates, nested_tests(candidates), chosen, verdict(given, chosen), sentences)
 
 
@@ -299,7 +299,7 @@ class _Fits:
             result.vpv,
             result.sigma0,
             cross_validate(result, self.options),
-            _correlated(result),
+            _high_correlations(result),
             result.warnings,
         )
 
@@ -380,7 +380,7 @@ def left_out_rows(network: Network, options: Options) -> Iterator[Indices]:
                 yield chosen
 
 
-def _correlated(result: Adjustment) -> tuple[tuple[str, str, float], ...]:
+def _high_correlations(result: Adjustment) -> tuple[tuple[str, str, float], ...]:
     """Pairs of highly correlated interior parameters of a camera, highest first."""
     several = len(result.network.cameras) > 1
     pairs = []
@@ -555,6 +555,6 @@ def _prediction(other: Candidate, chosen: Candidate) -> str:
 
 
 def _f_words(test: Nested) -> str:
-    chance = f"p = {test.p:.3f}" if test.p >= 0.001 else "p < 0.001"
+    p_text = f"p = {test.p:.3f}" if test.p >= 0.001 else "p < 0.001"
     f = f"{test.f:.3g}" if test.f < 1000.0 else f"{test.f:.0f}"
-    return f"F({test.degrees[0]}, {test.degrees[1]}) = {f}, {chance}"
+    return f"F({test.degrees[0]}, {test.degrees[1]}) = {f}, {p_text}"

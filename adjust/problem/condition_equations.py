@@ -125,15 +125,15 @@ def _lens(problem: Problem, state: State, camera: str) -> Lens:
 
 def observed_in_camera(problem: Problem, state: State) -> Array:
     """Transform the observations to camera coordinates (n, 2)."""
-    return in_camera(problem, state, problem.network.observations.xy_mm)
+    return camera_places(problem, state, problem.network.observations.xy_mm)
 
 
-def in_camera(problem: Problem, state: State, xy_mm: Array) -> Array:
+def camera_places(problem: Problem, state: State, xy_mm: Array) -> Array:
     """Transform comparator coordinates (n, 2) of the observations to camera coordinates (n, 2)."""
     camera_xy = np.empty_like(xy_mm)
     straight_mm = _straight(problem, state, xy_mm)
     for films in problem.films:
-        parameters = state.values[films.positions][films.of]
+        parameters = state.values[films.positions][films.image_rows]
         camera_xy[films.rows] = films.kind.apply(parameters, straight_mm[films.rows])
     return camera_xy
 
@@ -168,7 +168,7 @@ def _computed_in_comparator(problem: Problem, state: State, camera_xy: Array) ->
     xy_mm = np.empty_like(camera_xy)
     found = np.empty(len(camera_xy), dtype=bool)
     for films in problem.films:
-        parameters, rows = state.values[films.positions][films.of], _as_slice(films.rows)
+        parameters, rows = state.values[films.positions][films.image_rows], _as_slice(films.rows)
         xy_mm[rows], found[rows] = films.kind.inverse(parameters, camera_xy[rows], films.centers_mm)
     for scans in problem.scans:
         rows = scans.rows
@@ -267,10 +267,10 @@ def _film_derivatives(problem: Problem, state: State, xy_mm: Array) -> _FilmDeri
     widths = [max((each.positions.shape[-1] for each in some), default=0) for some in (problem.films, problem.scans)]
     film = _FilmDerivatives(zeros(count, 2), zeros(count, 2, 2), *(zeros(count, 2, width) for width in widths))
     for films in problem.films:
-        parameters, rows = state.values[films.positions][films.of], _as_slice(films.rows)
+        parameters, rows = state.values[films.positions][films.image_rows], _as_slice(films.rows)
         film.camera_xy[rows] = films.kind.apply(parameters, straight_mm[rows])
         film.xy_jacobian[rows] = films.kind.gradient(parameters, straight_mm[rows])
-        design = films.kind.design(parameters, straight_mm[rows], films.centers_mm, films.half_mm[films.of])
+        design = films.kind.design(parameters, straight_mm[rows], films.centers_mm, films.half_mm[films.image_rows])
         film.parameter_jacobian[rows, :, : design.shape[2]] = design
     for scans in problem.scans:
         rows = scans.rows

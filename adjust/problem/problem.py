@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from adjust.array_types import Array, Indices, Mask
+from adjust.functional_model.families import parameter_names
+from adjust.functional_model.lens import INTERIOR_NAMES
 from adjust.functional_model.rotation import angles_near, rotation_from_angles, rotation_from_vector, vector_by_angles
 from adjust.functional_model.scanner import Bend
 from adjust.functional_model.transformation import FilmKind, film_kind
@@ -58,12 +60,12 @@ class Films:
     center_mm: Array
     half_mm: Array
     rows: Indices  # (n,) rows of their observations
-    of: Indices  # (n,) index of each observation's image among the m
+    image_rows: Indices  # (n,) index of each observation's image among the m
 
     @cached_property
     def centers_mm(self) -> Array:
         """(n, 2) centre of the extent of each observation's image."""
-        return np.asarray(self.center_mm.T[:, self.of].T)
+        return np.asarray(self.center_mm.T[:, self.image_rows].T)
 
 
 @dataclass(frozen=True)
@@ -177,8 +179,8 @@ class Problem:
             positions = np.array([self.unknowns.transformation[name] for name in names], dtype=np.intp)
             center_mm = np.array([network.extent_by_image[name].center_mm for name in names])
             half_mm = np.array([network.extent_by_image[name].half_mm for name in names])
-            of = place[self.image_numbers[rows]]
-            found.append(Films(film_kind(*key), np.array(images), positions, center_mm, half_mm, rows, of))
+            image_rows = place[self.image_numbers[rows]]
+            found.append(Films(film_kind(*key), np.array(images), positions, center_mm, half_mm, rows, image_rows))
         return found
 
     @cached_property
@@ -203,10 +205,15 @@ class Problem:
     @cached_property
     def _image_positions(self) -> tuple[Indices, Indices, Indices, Indices]:
         """(images, k) positions of exterior orientation, film, camera and scanner, padded with ABSENT."""
-        of, images, none = self.unknowns, self.network.images, np.empty(0, dtype=np.intp)
-        cameras = side_by_side([of.camera[image.camera] for image in images])
-        scanners = side_by_side([of.scanner.get(image.scanner, none) for image in images])
+        unknowns, images, none = self.unknowns, self.network.images, np.empty(0, dtype=np.intp)
+        cameras = side_by_side([unknowns.camera[image.camera] for image in images])
+        scanners = side_by_side([unknowns.scanner.get(image.scanner, none) for image in images])
         return self.exterior, self.film_positions, cameras, scanners
+
+    def lens_positions(self, camera: str) -> dict[str, int]:
+        """Positions of the distortion parameters of a camera by their names."""
+        names = parameter_names(self.network.camera_by_name[camera].distortion.family)
+        return dict(zip(names, self.unknowns.camera[camera][len(INTERIOR_NAMES) :].tolist(), strict=True))
 
     @cached_property
     def film_positions(self) -> Indices:

@@ -17,7 +17,7 @@ from adjust.least_squares.iteration import Linearised
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.estimates import Cofactor
 from adjust.problem.problem import Problem, State
-from adjust.quality.run import Run, derivatives_by
+from adjust.quality.run import Run, derivatives_of
 from adjust.rank_defect.datum import free_motion
 
 FEWEST_IMAGES = 5  # needed to estimate standard deviations, then to about a third
@@ -107,7 +107,7 @@ class FactorCofactor:
 def free_cofactor(at: Linearised) -> FactorCofactor:
     """Cofactor matrix in the datum of the equations."""
     numbering = at.rows.numbering
-    return FactorCofactor(at.factor, _reported(numbering.problem, at.state)[:, numbering.free])
+    return FactorCofactor(at.factor, _reported_by_unknowns(numbering.problem, at.state)[:, numbering.free])
 
 
 def inner_cofactor(problem: Problem, at: Linearised, members: Indices) -> FactorCofactor:
@@ -116,7 +116,7 @@ def inner_cofactor(problem: Problem, at: Linearised, members: Indices) -> Factor
 
     With G the motions of the free datum and G_p their rows of these coordinates, P = (G_p' G_p)^-1 G_p'.
     """
-    reported, free = _reported(problem, at.state), at.rows.numbering.free
+    reported, free = _reported_by_unknowns(problem, at.state), at.rows.numbering.free
     by_free, motion = reported[:, free], free_motion(problem, at.state)
     part = np.zeros((len(problem.unknowns), motion.shape[1]))
     part[members] = np.linalg.pinv(motion[members]).T
@@ -125,7 +125,7 @@ def inner_cofactor(problem: Problem, at: Linearised, members: Indices) -> Factor
     return FactorCofactor(at.factor, by_free, datum)
 
 
-def _reported(problem: Problem, state: State) -> csr_array:
+def _reported_by_unknowns(problem: Problem, state: State) -> csr_array:
     """(n, n) derivatives of the reported quantities by the unknowns of the iteration."""
     # These are omega, phi, kappa by rotation vectors, and film parameters by centred ones. Where phi is +-90 degrees,
     # only the sum or difference of omega and kappa is determined (pseudo-inverse).
@@ -233,7 +233,7 @@ def image_equations(at: Linearised, positions: Indices) -> Iterator[tuple[int, A
     for rows in np.split(order, np.flatnonzero(np.diff(frames[order])) + 1):
         columns, matrix, right = problem.columns[rows], at.rows.matrix[rows], at.rows.right[rows].ravel()
         groups = positions, np.unique(columns[own[columns]])
-        by, by_own = (derivatives_by(problem, matrix, each, rows).toarray() for each in groups)
+        by, by_own = (derivatives_of(problem, matrix, each, rows).toarray() for each in groups)
         left, sizes, _ = np.linalg.svd(by_own / np.maximum(np.linalg.norm(by_own, axis=0), 1e-300), full_matrices=False)
         basis = left[:, sizes > UNDETERMINED * sizes[:1]]
         yield int(frames[rows[0]]), by - basis @ (basis.T @ by), right - basis @ (basis.T @ right)

@@ -174,7 +174,7 @@ class Weighting:
     weights: Array
     factors: Mapping[str, float] = field(default_factory=dict)
 
-    def applied(self, problem: Problem) -> tuple[Problem, Array]:
+    def apply(self, problem: Problem) -> tuple[Problem, Array]:
         """Apply the factors: the problem with new standard deviations of priors, and covariances (n, 2, 2), mm²."""
         units = TestedUnits(problem)
         count = len(problem.network.observations)

@@ -126,12 +126,14 @@ def compare(
     same, trend = _tests(views, when, min(redundancies, default=0.0))
     freeing, count = _freeing(views[0].unseen, len(shared)), len(places)
     one = np.eye(len(views))
-    field, covariance = map(np.array, zip(*(_freed(views, freeing, each - one[0]) for each in one[1:]), strict=True))
+    field, covariance = map(
+        np.array, zip(*(_free_view(views, freeing, each - one[0]) for each in one[1:]), strict=True)
+    )
     # the linear change from the first time to the last, by weighted regression
     variances = np.array([np.square(freeing @ view.root).sum(axis=1).mean() for view in views])
     weights = 1.0 / (variances + _UNSEEN_UM**2)
     along = when - np.average(when, weights=weights)
-    change, change_covariance = _freed(views, freeing, weights * along * np.ptp(when) / np.sum(weights * along**2))
+    change, change_covariance = _free_view(views, freeing, weights * along * np.ptp(when) / np.sum(weights * along**2))
     return Comparison(
         calibrations=tuple(calibrations),
         times=when,
@@ -227,7 +229,7 @@ def _freeing(unseen: Array, marks: int) -> Array:
     return np.asarray(by_field @ by_marks)
 
 
-def _freed(views: Sequence[_View], freeing: Array, factors: Array) -> tuple[Array, Array]:
+def _free_view(views: Sequence[_View], freeing: Array, factors: Array) -> tuple[Array, Array]:
     """Linear combination (m + f, 2) of the views without the changes without effect, and its covariance by place."""
     change = np.sum([k * (view.value - views[0].value) for k, view in zip(factors, views, strict=True)], axis=0)
     root = np.hstack([k * (freeing @ view.root) for k, view in zip(factors, views, strict=True)])

@@ -24,7 +24,7 @@ from adjust.quality.critical_values import Probabilities, Tested, robust_scale
 from adjust.quality.run import UNCHECKED, GrossError, Run, surplus
 
 UNCONTROLLED = 1e-4  # redundancy number below which only errors of hundreds of standard deviations are detectable
-TOLD_APART = 7.0  # difference of two statistics that decides between explanations: odds of 30 to 1
+DECISIVE = 7.0  # difference of two statistics that decides between explanations: odds of 30 to 1
 ALIKE_SHOWN = 3  # observations named with a suspect that residuals do not tell from it
 AT_ONCE = 20  # columns of V computed in one pass
 MOST_SUSPECT = 0.25  # largest fraction of gross errors; beyond it, right and wrong cannot be distinguished
@@ -279,8 +279,8 @@ class Snooping:
     def _significant_scale(self, units: Sequence[int]) -> float:
         """Root of v'Pv over redundancy without some units if it is significantly above 1, else 1."""
         vpv, redundancy = self.rest(units)
-        chance = redundancy < 1.0 or special.chdtrc(redundancy, vpv) > self.probabilities.family
-        return 1.0 if chance else float(np.sqrt(vpv / redundancy))
+        is_random = redundancy < 1.0 or special.chdtrc(redundancy, vpv) > self.probabilities.family
+        return 1.0 if is_random else float(np.sqrt(vpv / redundancy))
 
     def _median_scale(self, units: Sequence[int]) -> float:
         """Robust scale from the median of the other image points' statistics, at least 1."""
@@ -304,7 +304,7 @@ class Snooping:
         errors, joint = self._joint_errors(chosen)
         at = chosen.index(unit)
         others = self._reduced_statistics([each for each in chosen if each != unit])
-        near = np.flatnonzero((others > limits) & (others > joint[at] - TOLD_APART))
+        near = np.flatnonzero((others > limits) & (others > joint[at] - DECISIVE))
         alike = sorted((int(other) for other in near if other != unit), key=lambda other: -others[other])
         error = self.run.misfits.back[unit] @ errors[at]
         return GrossError(unit, float(joint[at]), float(limits[unit]), error, tuple(alike))

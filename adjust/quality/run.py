@@ -104,9 +104,9 @@ class Run:
 
         free: positions of quantities without their given values.
         """
-        weighted, covariance = self.weighting.applied(problem)
+        weighted, covariance = self.weighting.apply(problem)
         at = state or weighted.start()
-        return linearise(Numbering(weighted if free is None else freed(weighted, free)), covariance, at)
+        return linearise(Numbering(weighted if free is None else free_quantities(weighted, free)), covariance, at)
 
     @property
     def vpv(self) -> float:
@@ -198,7 +198,7 @@ class Run:
         given = np.flatnonzero(pairs != ABSENT)
         entries = -self._prior_weights.ravel()[given], (given, numbering.numbers[pairs[given]])
         priors = csr_array(entries, shape=(len(pairs), len(numbering.free)))
-        return csr_array(vstack([derivatives_by(numbering.problem, self.end.rows.matrix, numbering.free), priors]))
+        return csr_array(vstack([derivatives_of(numbering.problem, self.end.rows.matrix, numbering.free), priors]))
 
     @property
     def _prior_weights(self) -> Array:
@@ -212,14 +212,14 @@ class Run:
         return np.append(values, 0.0)[self.units.positions]
 
 
-def freed(problem: Problem, positions: Indices) -> Problem:
+def free_quantities(problem: Problem, positions: Indices) -> Problem:
     """Drop the given values of some quantities of a problem."""
     sigma = problem.unknowns.sigma.copy()
     sigma[positions] = np.inf
     return replace(problem, unknowns=replace(problem.unknowns, sigma=sigma))
 
 
-def derivatives_by(problem: Problem, matrix: Array, positions: Indices, rows: Indices | None = None) -> csr_array:
+def derivatives_of(problem: Problem, matrix: Array, positions: Indices, rows: Indices | None = None) -> csr_array:
     """(2 n, k) derivatives of all observations, or of some rows, by some quantities.
 
     matrix (n, 2, j): derivatives by the quantities at `Problem.columns`.

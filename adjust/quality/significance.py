@@ -29,16 +29,16 @@ from adjust.problem.further_observations import ObservedCalibration
 from adjust.problem.network import EXTERIOR_NAMES
 from adjust.problem.parameter import MANY, Kind, Parameter, shortened
 from adjust.quality.run import Run, surplus
+from adjust.rank_defect.directions import FIELD
 
 LEVEL = 0.01  # significance level: probability of calling a superfluous parameter significant
 FIXED = Prior(0.0)
 UNCHECKED = 1e-6  # redundancy of a prior below which it cannot be tested
 UNSEEN = 1e-6  # least redundancy of a direction that the other observations determine
-HIGH = 0.95  # correlation from which quantities are told to be hardly separable
+HIGH = 0.95  # correlation from which quantities are reported as hardly separable
 IMAGES_AT_ONCE = 16  # bounds the memory of correlations
 SHARE = 0.3  # least share in a direction of an element of the exterior orientation that is named
 SHOWN = 3  # images named one by one
-FIELD = 4  # known points needed for a known field
 
 
 @dataclass(frozen=True)

@@ -112,7 +112,7 @@ def _independent(motions: Array, least: Array | float, basis: Array) -> tuple[li
     return chosen, basis
 
 
-def centered(problem: Problem, state: State, members: Indices) -> State:
+def center_datum(problem: Problem, state: State, members: Indices) -> State:
     """Transform the state by the free similarity that brings some coordinates nearest to their given values, and, as
     far as these leave it open, the others nearest to their approximate values."""
     given = problem.unknowns.given[members]
@@ -127,7 +127,7 @@ def centered(problem: Problem, state: State, members: Indices) -> State:
         amount = np.linalg.lstsq(motion[is_given], off[is_given], rcond=FLAT)[0]
         rest = off[~is_given] - motion[~is_given] @ amount
         amount = amount + left_open @ np.linalg.lstsq(motion[~is_given] @ left_open, rest)[0]
-        state = _transformed(problem, state, datum, datum.free @ amount)
+        state = _transform_state(problem, state, datum, datum.free @ amount)
         if np.abs(amount).max(initial=0.0) <= EXACT * datum.extent:
             break
     return state
@@ -135,12 +135,12 @@ def centered(problem: Problem, state: State, members: Indices) -> State:
 
 def free_coordinates(problem: Problem, points: Sequence[str] = ()) -> Indices:
     """Positions of the object coordinates without a prior, of some points or of all."""
-    of = problem.unknowns.point
-    positions = np.concatenate([of[point] for point in points]) if points else problem.point_positions.ravel()
+    of_point = problem.unknowns.point
+    positions = np.concatenate([of_point[point] for point in points]) if points else problem.point_positions.ravel()
     return np.asarray(positions[np.isinf(problem.unknowns.sigma[positions])])
 
 
-def _transformed(problem: Problem, state: State, datum: ObjectDatum, amounts: Array) -> State:
+def _transform_state(problem: Problem, state: State, datum: ObjectDatum, amounts: Array) -> State:
     shift, turn, scale = amounts[:3], amounts[3:6] / datum.extent, 1.0 + amounts[6] / datum.extent
     if datum.free.shape[1] == len(amounts):  # all free: separate a large rotation from a change of scale
         sine = float(np.linalg.norm(turn))
@@ -184,8 +184,8 @@ def chosen_coordinates(problem: Problem, coordinates: Sequence[str]) -> Indices:
     """
     wanted = [object_coordinate(text) for text in coordinates]
     _check_points(problem, [parameter.id for parameter in wanted])
-    of, sigma = problem.unknowns.point, problem.unknowns.sigma
-    positions = np.array([of[each.id]["XYZ".index(each.quantity)] for each in wanted], dtype=np.intp)
+    of_point, sigma = problem.unknowns.point, problem.unknowns.sigma
+    positions = np.array([of_point[each.id]["XYZ".index(each.quantity)] for each in wanted], dtype=np.intp)
     for text, given in zip(coordinates, sigma[positions], strict=True):
         if np.isfinite(given):
             raise DatumError(

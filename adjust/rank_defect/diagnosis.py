@@ -205,7 +205,7 @@ def weak_directions(
     named, left = ([each for each in some if _motion(each) not in again] for some in found)
     if len(left) > NAMES_SHOWN:  # many directions that have no name, as one
         moved = tuple(dict.fromkeys(moved for each in left for moved in each.parameters))
-        left = [NullDirection(_collapsed(moved), *directions.many_sentence(len(left), directions.followers(moved)))]
+        left = [NullDirection(_collapse(moved), *directions.many_sentence(len(left), directions.followers(moved)))]
     return (*named, *left)
 
 
@@ -228,7 +228,7 @@ def undetermined(problem: Problem, state: State, variances: Array) -> str:
     unobserved = np.flatnonzero(np.sqrt(variances) > UNDETERMINED * prior)
     if not len(unobserved):
         return ""
-    shown = description(_collapsed([unknowns.parameters[i] for i in unobserved]))
+    shown = description(_collapse([unknowns.parameters[i] for i in unobserved]))
     statement = f"The observations say nothing about {shown}: their standard deviations stay as given"
     cameras = [name for name, positions in unknowns.camera.items() if np.isin(positions[:3], unobserved).any()]
     if not cameras:
@@ -254,7 +254,7 @@ def loose_principal_distances(problem: Problem, state: State, variances: Array) 
             )
 
 
-def _collapsed(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
+def _collapse(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
     """Collapse unknowns of one kind to one where there are many."""
     kinds: dict[Parameter, list[Parameter]] = {}
     for each in parameters:
@@ -275,7 +275,7 @@ def _named_directions(
     parameters = [problem.unknowns.parameters[i] for i in free]
     datum, numbers, rest = _datum_part(numbering, state, factor, blind, null)
     named = [
-        NullDirection(_collapsed([parameters[i] for i in _largest(vector)]), *directions.datum_sentence(number))
+        NullDirection(_collapse([parameters[i] for i in _largest(vector)]), *directions.datum_sentence(number))
         for vector, number in zip(datum.T, numbers, strict=True)
     ]
     # Add as much of the free datum as keeps the object points in place.
@@ -292,7 +292,7 @@ def _named_directions(
     for vector, i in zip(vectors.T, chosen, strict=True):
         # Always list the unknowns that give the name, however small.
         moved = [parameters[k] for k in dict.fromkeys([*_largest(vector), *np.flatnonzero(functionals[i]).tolist()])]
-        named.append(NullDirection(_collapsed(moved), *leads[i].sentence(moved)))
+        named.append(NullDirection(_collapse(moved), *leads[i].sentence(moved)))
     unnamed = []
     for vector in (still @ _complement(visibility[chosen], PURE)).T:
         # By the unknown that moves most: of one point or image, or of many.
@@ -301,7 +301,7 @@ def _named_directions(
             sentence = directions.own_sentence(problem, state, most)
         else:
             sentence = directions.unnamed_sentence(most, directions.followers(set(moved) - {most}))
-        unnamed.append(NullDirection(_collapsed(moved), *sentence))
+        unnamed.append(NullDirection(_collapse(moved), *sentence))
     return named, unnamed
 
 
@@ -380,12 +380,10 @@ def _largest(vector: Array) -> list[int]:
 def trading_off(problem: Problem) -> dict[str, list[int]]:
     """Positions of the free distortion parameters of each camera with a free numerator and denominator."""
     unknowns, found = problem.unknowns, {}
-    for name, positions in unknowns.camera.items():
-        of = family(problem.network.camera_by_name[name].distortion.family)
-        free = {
-            each: int(i) for each, i in zip(of.parameters, positions[3:], strict=True) if np.isinf(unknowns.sigma[i])
-        }
-        if not free.keys().isdisjoint(of.alike_at_zero) and len(problem.targets_by_camera[name]):
+    for name in unknowns.camera:
+        alike = family(problem.network.camera_by_name[name].distortion.family).alike_at_zero
+        free = {each: i for each, i in problem.lens_positions(name).items() if np.isinf(unknowns.sigma[i])}
+        if not free.keys().isdisjoint(alike) and len(problem.targets_by_camera[name]):
             found[name] = list(free.values())
     return found
 
@@ -415,7 +413,7 @@ def observed_radius_mm(problem: Problem, state: State, camera: str) -> float:
     return float(np.linalg.norm(xy_mm - principal_point, axis=1).max())
 
 
-def unresolved(pseudo_observed: Mapping[int, float], variances: Array) -> list[int]:
+def unresolved_motions(pseudo_observed: Mapping[int, float], variances: Array) -> list[int]:
     """Positions of the pseudo-observed parameters that the observations do not separate. variances (n,): a priori."""
     return [i for i, sigma in pseudo_observed.items() if np.sqrt(variances[i]) > UNRESOLVED * sigma]
 
@@ -435,11 +433,10 @@ def held_directions(problem: Problem, variances: Array) -> int:
 
 def inseparable(problem: Problem, state: State, variances: Array) -> dict[str, tuple[list[str], str]]:
     """Inseparable parameters of each camera that has some, and a sentence on them."""
-    inseparable_positions = set(unresolved(problem.pseudo_observed, variances))
+    inseparable_positions = set(unresolved_motions(problem.pseudo_observed, variances))
     found = {}
-    for name, positions in problem.unknowns.camera.items():
-        of = family(problem.network.camera_by_name[name].distortion.family)
-        names = [each for each, i in zip(of.parameters, positions[3:], strict=True) if int(i) in inseparable_positions]
+    for name in problem.unknowns.camera:
+        names = [each for each, i in problem.lens_positions(name).items() if i in inseparable_positions]
         if names:
             radius_mm = observed_radius_mm(problem, state, name)
             sentence = (

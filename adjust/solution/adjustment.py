@@ -111,7 +111,7 @@ def adjust_unmodelled(network: Network, options: Options | None = None, pixel_mm
     ----------
     network : marks with their standard deviations from image measurement
     options : of each adjustment
-    pixel_mm : side of a pixel of all images, for errors in px; None: they are told in µm
+    pixel_mm : side of a pixel of all images, for errors in px; None: they are given in µm
 
     Returns
     -------
@@ -379,7 +379,7 @@ class _Solver:
                 break
             places = {name: place + numbered[1].origin for name, place in found.places.items()}
             start, parts = replace(start, points={**start.points, **places}), numbered
-            rest, mismatched, unmet = _without_mismatches(network, found)
+            rest, mismatched, unmet = _leave_out_mismatches(network, found)
             if places:
                 parts = number_reduced(rest, start, options.method == "elements")
             now = _solve(rest, parts, options, doubted, mismatched)
@@ -444,7 +444,7 @@ def _solve(
     return replace(result, network=network, values=values)
 
 
-def _without_mismatches(
+def _leave_out_mismatches(
     network: Network, mismatches: Mismatches
 ) -> tuple[Network, dict[int, tuple[int, ...]], dict[str, str]]:
     """Remove the points whose rays do not meet from a network; also return its doubted rows, and sentences by point."""

@@ -117,7 +117,7 @@ def _sentence(
     at = ", ".join(f"{axis} = {value:.{digits}f}" for axis, value in zip("XYZ", place, strict=True))
     by = ", ".join(f"{axis} by {value:+.{digits}f}" for axis, value in zip("XYZ", off, strict=True))
     missed = f"{far.miss_mm:.3g} mm from its marks" if np.isfinite(far.miss_mm) else "behind the camera"
-    # Clerical errors that explain the coordinates; told where there is exactly one.
+    # Clerical errors that explain the coordinates; reported where there is exactly one.
     readings = [
         (own[[j if k == i else i if k == j else k for k in range(3)]], f"{'XYZ'[i]} and {'XYZ'[j]} look exchanged.")
         for i, j in combinations(range(3), 2)

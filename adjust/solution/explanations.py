@@ -27,7 +27,7 @@ orientations makes them, principal distances of their own scatter more than prin
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
+from itertools import chain, product
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -38,11 +38,12 @@ from adjust.functional_model.distortion_models import UM_PER_MM
 from adjust.problem.problem import Problem
 from adjust.quality.cofactor import free_cofactor
 from adjust.quality.critical_values import Probabilities
-from adjust.quality.reliability import TOLD_APART, Snooping
+from adjust.quality.reliability import DECISIVE, Snooping
 from adjust.quality.run import GrossError, Run, residuals
 from adjust.quality.variance_components import added_variance, refined_factors
 from adjust.rank_defect.diagnosis import singular_directions
-from adjust.solution.model_hypotheses import Estimate, ModelHypothesis, continued, model_hypotheses, wrong_points
+from adjust.solution.model_hypotheses import Estimate, ModelHypothesis, continue_problem, model_hypotheses
+from adjust.solution.point_hypotheses import point_hypotheses, wrong_points
 from adjust.solution.reweighting import again
 
 LEVEL = 0.001  # probability of reporting anything where the model is correct
@@ -61,7 +62,7 @@ OF_POINTS = ("board", "disks", "point")
 # Kinds of hypotheses with unknowns for every image, and the simpler ones that may explain as much.
 GENERAL = {"distances": ("drift", "groups"), "affinities": OF_IMAGES + OF_POINTS}
 FEWEST = 30  # coordinates needed to test the distribution of residuals
-CHANCE = 0.001  # significance level of each test of the noise hypothesis
+NOISE_LEVEL = 0.001  # significance level of each test of the noise hypothesis
 NEIGHBOURS = 8  # nearest neighbours searched for one in the same, or in another, image
 UNCHECKED = 0.05  # redundancy number below which a residual is not tested
 
@@ -191,11 +192,11 @@ class _Model:
 
     def is_significant(self, hypothesis: ModelHypothesis, fall: float, level: float, share: float = 1.0) -> bool:
         """Whether a decrease of v'Pv is significant, and of a share of what errors correlated within images cause."""
-        fall_beyond_chance = fall - len(hypothesis.added) * self.variance
-        is_large = fall_beyond_chance > share * LEFT * self.unmodelled * self.vpv or (
+        excess_fall = fall - len(hypothesis.added) * self.variance
+        is_large = excess_fall > share * LEFT * self.unmodelled * self.vpv or (
             # Curled edges of real boards remove up to 0.3 as points beside a line.
             hypothesis.name != "group"
-            and fall_beyond_chance > LEAST_SHARE * self.vpv
+            and excess_fall > LEAST_SHARE * self.vpv
             and hypothesis.selection.p_scatter() < LEVEL
         )
         return is_large and self.probability(hypothesis, fall) < level
@@ -215,17 +216,17 @@ class _Model:
         variance = (self.vpv - fall) / left
         return float(fdtrc(count, left, fall / (count * variance)) if variance > 1.0 else chdtrc(count, fall))
 
-    def adjusted(self, problem: Problem) -> Run | None:
+    def adjust(self, problem: Problem) -> Run | None:
         """Adjust a larger problem from its start with the same weights; None without a solution."""
         larger = again(replace(self.run, problem=problem), self.run.weighting, STEPS, problem.start())
         return larger if larger.converged else None
 
-    def extended(self, hypothesis: ModelHypothesis, level: float) -> "_Model | None":
+    def extend(self, hypothesis: ModelHypothesis, level: float) -> "_Model | None":
         """Add a hypothesis to the model; None without a solution within its limits, or where it is not significant.
 
         It is tested by the actual decrease of v'Pv, and beside gross errors that it leaves also without them.
         """
-        run, (low, high) = self.adjusted(hypothesis.problem), hypothesis.limits
+        run, (low, high) = self.adjust(hypothesis.problem), hypothesis.limits
         values = None if run is None else run.end.state.values[hypothesis.added]
         if run is None or values is None or not ((values >= low) & (values <= high)).all():
             return None
@@ -245,7 +246,8 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
     is_suspicious = model.exceeds(SUSPECTED) or bool(model.gross_errors)
     tested = {board.name for board in model.run.problem.network.boards}
     falls = list[tuple[float, ModelHypothesis]]()
-    for each in model_hypotheses(model.run, is_suspicious, bool(model.unmodelled)):
+    kinds = (model_hypotheses, point_hypotheses)
+    for each in chain(*(kind(model.run, is_suspicious, bool(model.unmodelled)) for kind in kinds)):
         if each.name not in tested:
             at = model.run.linearised(each.problem)
             is_regular = at is not None and not singular_directions(at.rows.numbering, at.state, at.factor)
@@ -254,7 +256,7 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
     worth = WORTH * max((fall for fall, _ in falls), default=0.0)
     likely = [(fall, each) for fall, each in falls if fall > worth and model.is_significant(each, fall, level, WORTH)]
     likely.sort(key=lambda each: -each[0])
-    candidates = [model.extended(each, level) for _, each in likely[:MOST_ADJUSTED]]
+    candidates = [model.extend(each, level) for _, each in likely[:MOST_ADJUSTED]]
     found = [each for each in candidates if each is not None]
     if not found:
         return [], False
@@ -263,10 +265,10 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
         found = _without_nested(found, variance, general, special)
     criteria = [each.criterion(variance) + each.costs for each in found]
     without = model.criterion(variance) - min(criteria) if model.gross_errors else np.inf
-    if without < -TOLD_APART:
+    if without < -DECISIVE:
         return [], False
-    alike = [each for each, own in zip(found, criteria, strict=True) if own < min(criteria) + TOLD_APART]
-    return alike, bool(without < TOLD_APART)
+    alike = [each for each, own in zip(found, criteria, strict=True) if own < min(criteria) + DECISIVE]
+    return alike, bool(without < DECISIVE)
 
 
 def _without_nested(found: list[_Model], variance: float, general: str, special: tuple[str, ...]) -> list[_Model]:
@@ -283,13 +285,13 @@ def _with_separate_lenses(model: _Model) -> _Model | None:
     network = model.run.problem.network
     if any(camera.fiducials for camera in network.cameras):
         return None
-    problem, old = continued(model.run, network), model.run.problem.unknowns
+    problem, old = continue_problem(model.run, network), model.run.problem.unknowns
     unknowns = problem.unknowns
     sigma, start = unknowns.sigma.copy(), unknowns.start.copy()
     for name, at in old.camera.items():
         own = unknowns.camera[name]
         sigma[own], start[own] = old.sigma[at], model.run.end.state.values[at]
-    run = model.adjusted(replace(problem, unknowns=replace(unknowns, sigma=sigma, start=start)))
+    run = model.adjust(replace(problem, unknowns=replace(unknowns, sigma=sigma, start=start)))
     if run is None:
         return None
     added = len(run.numbering.free) - len(model.run.numbering.free)
@@ -315,8 +317,8 @@ def _model_explanation(larger: _Model, model: _Model) -> Explanation:
 
 def _explanation(kind: str, words: tuple[str, str], p: float, without: _Model, larger: _Model) -> Explanation:
     sigma0 = float(np.sqrt(without.variance)), float(np.sqrt(larger.variance))
-    chance = f"p = {p:.1g}" if p > 1e-99 else "p < 1e-99"
-    figures = f"with this in the model σ₀ falls from {sigma0[0]:.3g} to {sigma0[1]:.3g} ({chance})"
+    p_text = f"p = {p:.1g}" if p > 1e-99 else "p < 1e-99"
+    figures = f"with this in the model σ₀ falls from {sigma0[0]:.3g} to {sigma0[1]:.3g} ({p_text})"
     return Explanation(kind, f"{words[0]}; {figures}.", words[1], p, sigma0)
 
 
@@ -371,7 +373,7 @@ def _added_noise(run: Run, redundancy: int) -> Noise | None:
 def _wide_control(run: Run) -> Noise | None:
     """Adjust with larger standard deviations of the given points that explain all residuals; None where none do."""
     vpv, freedom = run.group_sums((run.units.groups == "control") & run.weighting.used)
-    if run.weighting.factors or freedom < CHECKED or chdtrc(freedom, vpv) > CHANCE:
+    if run.weighting.factors or freedom < CHECKED or chdtrc(freedom, vpv) > NOISE_LEVEL:
         return None
     wide = replace(run, weighting=replace(run.weighting, factors={"control": 1.0}))
     for _ in range(TURNS):
@@ -402,13 +404,13 @@ def _is_noise(run: Run) -> bool:
     present = freedom > 1.0
     variance = shares.sum() / freedom.sum()
     square = ((shares[present] / variance - freedom[present]) ** 2 / (2.0 * freedom[present])).sum()
-    if present.sum() >= 2 and not chdtrc(present.sum() - 1, square) > CHANCE:
+    if present.sum() >= 2 and not chdtrc(present.sum() - 1, square) > NOISE_LEVEL:
         return False
     # Sums of products of residuals, of expectation 0 if independent, are not significantly positive.
     for products in _neighbour_products(run, checked, w, images):
         if len(products) > 2:
             z = products.sum() / np.sqrt(2.0 * (products**2).sum())  # factor 2: most pairs of neighbours occur twice
-            if ndtr(-z) < 0.5 * CHANCE:
+            if ndtr(-z) < 0.5 * NOISE_LEVEL:
                 return False
     return True
 
@@ -436,6 +438,6 @@ def _groups_agree(run: Run) -> bool:
     """Whether every group of observations agrees with its standard deviations in a two-sided test."""
     for name in np.unique(run.units.groups):
         vpv, freedom = run.group_sums((run.units.groups == name) & run.weighting.used)
-        if freedom > 1.0 and min(chdtr(freedom, vpv), chdtrc(freedom, vpv)) < CHANCE:
+        if freedom > 1.0 and min(chdtr(freedom, vpv), chdtrc(freedom, vpv)) < NOISE_LEVEL:
             return False
     return True

@@ -1,23 +1,18 @@
 """Hypotheses on errors of the model: larger problems that start where the adjustment without their unknowns ended.
 
 So one linearised step estimates the fall of v'Pv. The words of a hypothesis are made of the estimates of its unknowns:
-of the cameras (lens terms, pixels, interior orientations), of scans and films, and of the given points (a deformed
-object, disks of another diameter, wrong coordinates).
+here of the cameras (lens terms, pixels, interior orientations), and of scans and films.
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain, combinations, product
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import KDTree
-from scipy.special import chdtrc
 
-from adjust.array_types import Array, Indices, Mask
-from adjust.functional_model.board import BoardForm, board_form, disk_directions, strain_directions
+from adjust.array_types import Array, Indices
 from adjust.functional_model.correction import AFFINITY_TERMS, ZERO, PolynomialTerms, Term, decentering, radial
 from adjust.functional_model.distortion_models import UM_PER_MM
 from adjust.functional_model.families import family
@@ -25,23 +20,15 @@ from adjust.functional_model.lens import INTERIOR_NAMES, Prior
 from adjust.functional_model.scanner import is_left
 from adjust.functional_model.transformation import LATTICE, film_kind, fit_transformation
 from adjust.problem.camera import Camera
-from adjust.problem.condition_equations import computed_observations, in_camera, object_displacements
+from adjust.problem.condition_equations import camera_places, object_displacements
 from adjust.problem.network import Approximations, Board, Network, Scanner, Transformation
 from adjust.problem.parameter import shortened
-from adjust.problem.problem import Problem, State, number
-from adjust.quality.cofactor import free_cofactor
-from adjust.quality.run import Run, freed
-from adjust.solution.partitions import (
-    Selection,
-    displaced_points,
-    interior_equations,
-    jumps,
-    own_distances,
-    two_groups,
-)
+from adjust.problem.problem import Problem, number
+from adjust.quality.run import Run, free_quantities
+from adjust.solution import partitions
 
 FREE = Prior(0.0, np.inf)
-NONE = Selection()
+NONE = partitions.Selection()
 REFOCUSED = "Fix focus and zoom, switch autofocus and stabilisation off, and take the pictures again."
 RADIAL_DEGREES = (3, 5, 7, 9, 11, 13)  # powers of the radius, as of k1 to k6
 TERMS_TOGETHER = 2  # radial terms tested jointly
@@ -54,13 +41,7 @@ RICHER: dict[Transformation, tuple[Transformation, ...]] = {  # film deformation
     "similarity": ("affine", "projective"),
     "affine": ("projective", "bilinear", "polynomial(2)"),
 }
-CLEAR = 3.0  # standard deviations above which one of two changes of a board is told
-FEWEST_GIVEN, FEWEST_IMAGES = 5, 2  # given points, and images of one, that tell a wrong one
-MISMEASURED = 0.1  # relative error of the given diameter of disks whose effect is reported
-MOST_NAMED = 10  # points named in a message
-FEWEST_ALIKE = 3  # points whose shifts tell that all are the same
-LEVEL = 0.001  # probability of calling a point wrong that is where it is given, or equal shifts unequal
-INDEPENDENT = "points' unit; ± for independent errors, on real boards up to 5 times as much"
+FEWEST_IMAGES = 2  # images that tell a rolling shutter
 ALIKE = 7.0  # difference of chi-square plus twice the unknowns below which two readings are not distinguished
 
 
@@ -86,7 +67,7 @@ class ModelHypothesis:
     added: Indices  # (k,) positions of the additional unknowns
     name: str = ""  # of the displacement that is added
     limits: tuple[float, float] = (-np.inf, np.inf)  # possible values of the unknowns
-    selection: Selection = NONE
+    selection: partitions.Selection = NONE
     shown: Indices | None = None  # positions of the unknowns that the words tell; all those added where None
 
 
@@ -94,7 +75,7 @@ OTHERS = " (other images)"  # suffix of a camera's name for the images with a di
 
 
 def model_hypotheses(run: Run, is_suspicious: bool, is_fitted: bool) -> Iterator[ModelHypothesis]:
-    """All hypotheses that apply: on every camera, on scans and films, and on the given points.
+    """All hypotheses that apply on every camera, on scans and films.
 
     is_suspicious: whether residuals are larger than the given standard deviations allow; is_fitted: whether those of
     unmodelled errors were estimated from them.
@@ -110,27 +91,22 @@ def model_hypotheses(run: Run, is_suspicious: bool, is_fitted: bool) -> Iterator
     yield from _scanner_pixels(run)
     if is_suspicious:
         yield from film_deformations(run)
-    yield from _deformations(run)
-    yield from _disks(run)
-    # Errors of a real board's points are part of the noise that is fitted: none of them is told but the worst.
-    if is_suspicious or is_fitted:
-        yield from _wrong_points(run, 1 if is_fitted else len(network.points))
 
 
-def displaced(run: Run, name: str, kind: str, words: Words, directions: Array) -> ModelHypothesis:
+def displace_points(run: Run, name: str, kind: str, words: Words, directions: Array) -> ModelHypothesis:
     """Add displacements (n, k, 3) of the targets' points as unknowns."""
     network = run.problem.network
     board = Board(name, {}, (FREE,) * directions.shape[1], directions)
-    problem = continued(run, replace(network, boards=(*network.boards, board)))
+    problem = continue_problem(run, replace(network, boards=(*network.boards, board)))
     return ModelHypothesis(kind, words, problem, problem.unknowns.board[name], name=name)
 
 
-def continued_with(run: Run, positions: Indices) -> Problem:
+def free_and_continue(run: Run, positions: Indices) -> Problem:
     """Free some quantities of a problem; start where an adjustment ended."""
-    return freed(continued(run, run.problem.network), positions)
+    return free_quantities(continue_problem(run, run.problem.network), positions)
 
 
-def continued(run: Run, network: Network, like: Mapping[str, str] | None = None) -> Problem:
+def continue_problem(run: Run, network: Network, like: Mapping[str, str] | None = None) -> Problem:
     """Number a network with additional unknowns; start where an adjustment ended, in its datum.
 
     like: additional cameras, with those whose interior orientation they start with.
@@ -170,67 +146,72 @@ def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
 
     Polynomials of the observed point in units of half the frame, so that their parameters are in mm at its edge.
     """
-    of, network, who = family(camera.distortion.family), run.problem.network, f"camera {camera.name}"
-    free = {name for name, prior in camera.distortion.parameters.items() if prior.sigma > 0.0}
-    held = {name for name, prior in camera.distortion.parameters.items() if prior.value} - free
-    groups = {name: dict(of.groups).get(name, ()) for name in ("radial", "decentering", "affinity")}
+    network, groups = run.problem.network, dict(family(camera.distortion.family).groups)
+    free = camera.distortion.free
     images = [image for image in network.images if image.camera == camera.name]
     half_mm = camera.distortion.half_mm[0] or max(network.extent_by_image[image.name].half_mm for image in images)
     places = _from_principal_point(run, camera)
-
-    def too_simple(group: str, what: str) -> Words:
-        # Terms of a denominator are asked for by nobody at first.
-        fixed = [name for name in groups[group] if name not in {*of.alike_at_zero, *free}]
-        if camera.distortion.family == "none":
-            names = "k1 and k2" if group == "radial" else "p1 and p2"
-            remedy = f'Give the camera a [distortion] of the family "brown", say, with {names} free.'
-        elif fixed:
-            remedy = f'Free {", ".join(fixed)} under [distortion.sigma] of the camera ("free").'
-        else:
-            remedy = (
-                "Choose a distortion family with more terms, legendre(5) say; `reseau adjust --choose` compares some."
-            )
-        wrong = [name for name in groups[group] if name in held]
-        doubt = f", or what is given as exact, {', '.join(wrong)}, is wrong" if wrong else ""
-        cause = f"The lens model of {who} is too simple{doubt}: the residuals have {what}"
-        return lambda found: (f"{cause}, {found.rms_um:.2g} µm rms", remedy)
-
-    def bowed(found: Estimate) -> tuple[str, str]:
-        (x_um, y_um), sigma_um = UM_PER_MM * found.value, UM_PER_MM * found.sigma
-        return (
-            f"The pictures of {who} are bowed: half the frame off the middle, columns lie {x_um:+.3g} ± "
-            f"{sigma_um[0]:.1g} µm aside and rows {y_um:+.3g} ± {sigma_um[1]:.1g} µm",
-            "Look for a rolling shutter, stabilisation or a scanner's lens. Use a distortion family with such "
-            "terms, for example legendre(3).",
-        )
-
-    def sheared(found: Estimate) -> tuple[str, str]:
-        return (
-            f"The axes of the pictures of {who} are not perpendicular: b2 = {found.value[0] / half_mm:+.2g} ± "
-            f"{found.sigma[0] / half_mm:.1g}",
-            "Free the shear b2 of the distortion (families brown, opencv), or scan them once more: sensors have none.",
-        )
-
-    estimated = {3 + 2 * k for k, name in enumerate(groups["radial"]) if name in free}
+    estimated = {3 + 2 * k for k, name in enumerate(groups.get("radial", ())) if name in free}
     degrees = [degree for degree in RADIAL_DEGREES if degree not in estimated] or RADIAL_DEGREES[-TERMS_TOGETHER:]
     degrees = degrees[:TERMS_TOGETHER]
     pattern = f"a radial pattern, of the degrees {', '.join(map(str, degrees))} in r"
     rows: list[tuple[str, Sequence[Term], Words]] = [
-        ("radial", [radial((degree - 1) // 2) for degree in degrees], too_simple("radial", pattern))
+        ("radial", [radial((degree - 1) // 2) for degree in degrees], _too_simple_words(camera, "radial", pattern))
     ]
-    if not free.intersection(groups["decentering"][2:]):
-        power = int(bool(free.intersection(groups["decentering"])))
-        words = too_simple("decentering", "a tangential pattern (decentering)")
-        rows.append(("decentering", decentering(power), words))
-    rows.append(("bow", BOW, bowed))
+    of_decentering = groups.get("decentering", ())
+    if not free.intersection(of_decentering[2:]):
+        words = _too_simple_words(camera, "decentering", "a tangential pattern (decentering)")
+        rows.append(("decentering", decentering(int(bool(free.intersection(of_decentering)))), words))
+    rows.append(("bow", BOW, partial(_bow_words, camera.name)))
     if all(image.transformation == "none" for image in images):
-        affinity = ("pixels", _pixel_words(camera.name, 1.0 / half_mm)), ("shear", sheared)
+        affinity: tuple[tuple[str, Words], ...] = (
+            ("pixels", _pixel_words(camera.name, 1.0 / half_mm)),
+            ("shear", partial(_shear_words, camera.name, half_mm)),
+        )
         for k, (name, words) in enumerate(affinity):
-            if not free.intersection(groups["affinity"][k : k + 1]):
+            if not free.intersection(groups.get("affinity", ())[k : k + 1]):
                 rows.append((name, AFFINITY_TERMS[k : k + 1], words))
     for name, terms, words in rows:
         fields = PolynomialTerms.from_terms(terms).correction(places, np.zeros(2), np.zeros(len(terms)), half_mm)
         yield _displaced_images(run, name, name, camera, words, fields.parameter_jacobian.swapaxes(1, 2))
+
+
+def _too_simple_words(camera: Camera, group: str, what: str) -> Words:
+    """Words on a lens model without terms of a group; what: pattern of the residuals."""
+    lens_family, distortion = family(camera.distortion.family), camera.distortion
+    names, free = dict(lens_family.groups).get(group, ()), distortion.free
+    # Terms of a denominator are asked for by nobody at first.
+    fixed = [name for name in names if name not in {*lens_family.alike_at_zero, *free}]
+    if distortion.family == "none":
+        terms = "k1 and k2" if group == "radial" else "p1 and p2"
+        remedy = f'Give the camera a [distortion] of the family "brown", say, with {terms} free.'
+    elif fixed:
+        remedy = f'Free {", ".join(fixed)} under [distortion.sigma] of the camera ("free").'
+    else:
+        remedy = "Choose a distortion family with more terms, legendre(5) say; `reseau adjust --choose` compares some."
+    held = {name for name, prior in distortion.parameters.items() if prior.value} - free
+    wrong = [name for name in names if name in held]
+    doubt = f", or what is given as exact, {', '.join(wrong)}, is wrong" if wrong else ""
+    cause = f"The lens model of camera {camera.name} is too simple{doubt}: the residuals have {what}"
+    return lambda found: (f"{cause}, {found.rms_um:.2g} µm rms", remedy)
+
+
+def _bow_words(camera: str, found: Estimate) -> tuple[str, str]:
+    (x_um, y_um), sigma_um = UM_PER_MM * found.value, UM_PER_MM * found.sigma
+    return (
+        f"The pictures of camera {camera} are bowed: half the frame off the middle, columns lie {x_um:+.3g} ± "
+        f"{sigma_um[0]:.1g} µm aside and rows {y_um:+.3g} ± {sigma_um[1]:.1g} µm",
+        "Look for a rolling shutter, stabilisation or a scanner's lens. Use a distortion family with such "
+        "terms, for example legendre(3).",
+    )
+
+
+def _shear_words(camera: str, half_mm: float, found: Estimate) -> tuple[str, str]:
+    return (
+        f"The axes of the pictures of camera {camera} are not perpendicular: b2 = {found.value[0] / half_mm:+.2g} ± "
+        f"{found.sigma[0] / half_mm:.1g}",
+        "Free the shear b2 of the distortion (families brown, opencv), or scan them once more: sensors have none.",
+    )
 
 
 def _pixel_words(camera: str, per_mm: float) -> Words:
@@ -275,10 +256,10 @@ def _own_affinities(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
 
     # Affinities of all images of a flat object leave the interior orientation open, and contain the camera's own: these
     # are held where they are.
-    unknowns, of = problem.unknowns, family(camera.distortion.family)
-    known = {*INTERIOR_NAMES, *dict(of.groups).get("affinity", ())}
+    unknowns, lens_family = problem.unknowns, family(camera.distortion.family)
+    known = {*INTERIOR_NAMES, *dict(lens_family.groups).get("affinity", ())}
     sigma = unknowns.sigma.copy()
-    sigma[unknowns.camera[camera.name][[name in known for name in (*INTERIOR_NAMES, *of.parameters)]]] = 0.0
+    sigma[unknowns.camera[camera.name][[name in known for name in (*INTERIOR_NAMES, *lens_family.parameters)]]] = 0.0
     held = replace(run, problem=replace(problem, unknowns=replace(unknowns, sigma=sigma)))
     by_affinity_mm = fields_mm.reshape(len(fields_mm), -1, 2)
     yield _displaced_images(held, "affinities", "affinities", camera, words, by_affinity_mm)
@@ -320,7 +301,7 @@ def _from_principal_point(run: Run, camera: Camera) -> Array:
     problem, xy_mm = run.problem, np.zeros_like(run.end.v_mm)
     rows = problem.targets_by_camera[camera.name]
     principal_point = run.end.state.values[problem.unknowns.camera[camera.name][1:3]]
-    xy_mm[rows] = in_camera(problem, run.end.state, run.end.computed_mm)[rows] - principal_point
+    xy_mm[rows] = camera_places(problem, run.end.state, run.end.computed_mm)[rows] - principal_point
     return xy_mm
 
 
@@ -328,9 +309,11 @@ def _displaced_images(
     run: Run, name: str, kind: str, camera: Camera, words: Words, fields_mm: Array
 ) -> ModelHypothesis:
     """Add displacements (n, k, 2) of the camera's images in mm as unknowns."""
-    camera_xy = in_camera(run.problem, run.end.state, run.end.computed_mm)  # observed places have the residuals' errors
+    camera_xy = camera_places(
+        run.problem, run.end.state, run.end.computed_mm
+    )  # observed places have the residuals' errors
     directions = object_displacements(run.problem, run.end.state, camera_xy, fields_mm)
-    return displaced(run, f"{name} of {camera.name}", kind, words, directions)
+    return displace_points(run, f"{name} of {camera.name}", kind, words, directions)
 
 
 def _scanner_pixels(run: Run) -> Iterator[ModelHypothesis]:
@@ -344,7 +327,7 @@ def _scanner_pixels(run: Run) -> Iterator[ModelHypothesis]:
     half_mm = max(extent.half_mm for extent in extents)
     scanner = Scanner("scanner", {"stretch": FREE}, (x, y), (half_mm, half_mm))
     images = tuple(replace(image, scanner=scanner.name) if image in films else image for image in network.images)
-    problem = continued(run, replace(network, images=images, scanners=(scanner,)))
+    problem = continue_problem(run, replace(network, images=images, scanners=(scanner,)))
     words = _pixel_words(films[0].camera, 2.0 / half_mm)
     yield ModelHypothesis("pixels", words, problem, problem.unknowns.scanner[scanner.name])
 
@@ -354,7 +337,7 @@ def _jumps(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     rows = run.problem.targets_by_camera[camera.name]
     if any(each.transformation != "none" for each in run.problem.network.images if each.camera == camera.name):
         return
-    for jump in jumps(run, rows):
+    for jump in partitions.jumps(run, rows):
         who = f"image {jump.image}" if jump.image else f"the images of camera {camera.name}"
         where = f"{'above' if jump.axis else 'right of'} {'xy'[jump.axis]} = {jump.cut_mm:.4g} mm"
 
@@ -369,7 +352,9 @@ def _jumps(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
         fields_mm = jump.beyond[:, None, None] * np.eye(2)
         found = _displaced_images(run, f"jump {jump.image}", "jump", camera, words, fields_mm)
         # The best of as many jumps as there are coordinates.
-        yield replace(found, selection=Selection(choices=float(np.log(2.0 * len(rows))), contrasts=2 * len(rows)))
+        yield replace(
+            found, selection=partitions.Selection(choices=float(np.log(2.0 * len(rows))), contrasts=2 * len(rows))
+        )
 
 
 def film_deformations(run: Run) -> Iterator[ModelHypothesis]:
@@ -379,7 +364,7 @@ def film_deformations(run: Run) -> Iterator[ModelHypothesis]:
     for kind in RICHER.get(min(given), ()) if len(given) == 1 else ():
         films = [image.name for image in network.images if image.transformation in given]
         images = tuple(replace(each, transformation=kind) if each.name in films else each for each in network.images)
-        problem = continued(run, replace(network, images=images))
+        problem = continue_problem(run, replace(network, images=images))
         count = len(run.problem.unknowns.transformation[films[0]])
         added = np.concatenate([problem.unknowns.transformation[name][count:] for name in films])
 
@@ -409,32 +394,34 @@ def _wrong_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypot
         )
 
     if len(added):
-        yield ModelHypothesis("interior", words, continued_with(run, added), added)
+        yield ModelHypothesis("interior", words, free_and_continue(run, added), added)
 
 
 def _interior_orientations(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     """Another interior orientation for some of the camera's images, or another principal distance for each."""
-    equations = interior_equations(run, camera.name)
-    if (groups := two_groups(run, camera.name, equations)) is not None:
+    equations = partitions.interior_equations(run, camera.name)
+    if (groups := partitions.two_groups(run, camera.name, equations)) is not None:
         who = f"the images {shortened(groups.names, NAMED)} ({len(groups.names)} of {len(equations.names)})"
-        problem, added = _apart(run, camera, dict.fromkeys(groups.names, camera.name + OTHERS), len(INTERIOR_NAMES))
+        problem, added = _separate_cameras(
+            run, camera, dict.fromkeys(groups.names, camera.name + OTHERS), len(INTERIOR_NAMES)
+        )
         shown = np.concatenate([added, problem.unknowns.camera[camera.name][: len(INTERIOR_NAMES)]])
         words = partial(_group_words, f"{who} of camera {camera.name}")
         yield ModelHypothesis("groups", words, problem, added, selection=groups, shown=shown)
-    if (images := own_distances(run, equations)) is not None:
+    if (images := partitions.own_distances(run, equations)) is not None:
         others = {name: f"{camera.name}, {name}{OTHERS}" for name in images.names}
-        problem, added = _apart(run, camera, others, 1)
+        problem, added = _separate_cameras(run, camera, others, 1)
         shown = np.append(problem.unknowns.camera[camera.name][:1], added)
         words = partial(_distance_words, camera.name, equations.names)
         yield ModelHypothesis("distances", words, problem, added, selection=images, shown=shown)
 
 
-def _apart(run: Run, camera: Camera, others: Mapping[str, str], count: int) -> tuple[Problem, Indices]:
+def _separate_cameras(run: Run, camera: Camera, others: Mapping[str, str], count: int) -> tuple[Problem, Indices]:
     """Give some frames cameras of other names that differ in the first `count` quantities; also return these."""
     network, names = run.problem.network, dict.fromkeys(others.values(), camera.name)
     images = tuple(replace(each, camera=others.get(each.frame, each.camera)) for each in network.images)
     cameras = (*network.cameras, *(replace(camera, name=name) for name in names))
-    problem = continued(run, replace(network, images=images, cameras=cameras), names)
+    problem = continue_problem(run, replace(network, images=images, cameras=cameras), names)
     unknowns = problem.unknowns
     given, sigma, start = unknowns.given.copy(), unknowns.sigma.copy(), unknowns.start.copy()
     of_camera, fiducial, own = dict(unknowns.camera), dict(unknowns.fiducial), unknowns.camera[camera.name]
@@ -510,286 +497,3 @@ def _group_words(who: str, found: Estimate) -> tuple[str, str]:
         f"{causes[0].upper()}{causes[1:]}",
         "Give these images a camera of their own (column camera of images.csv), or a folder and project of their own.",
     )
-
-
-def _deformations(run: Run) -> Iterator[ModelHypothesis]:
-    """A strain of the object of all given points; a bend or a twist of a flat one, or another diameter of its disks."""
-    network = run.problem.network
-    if not _is_given(network):
-        return
-
-    form = _flat_form(network)
-    axes = np.eye(3) if form is None else form.axes
-    strain = strain_directions(np.array(list(network.known_places.values())), axes)
-    rows: list[tuple[str, Words, Array]] = [("strain", lambda found: _strain_words(len(axes), found), strain)]
-    if form is not None:
-        is_bent = any(board.by_observation is None for board in network.boards)
-        bends = [form.twist_directions] if is_bent else [form.bend_directions, form.twist_directions]
-        rows += [("bend", _bend_words, np.concatenate(bends, axis=1))]
-    for name, words, directions in rows:
-        by_point = dict(zip(network.known_places, directions, strict=True))
-        yield displaced(run, name, "board", words, _of_targets(run, by_point))
-
-
-def _bend_words(found: Estimate) -> tuple[str, str]:
-    """Describe bends along the two axes of a board, where these are not adjusted anyway, and a twist."""
-    (*bends, twist), (*bend_sigmas, twist_sigma) = found.value, found.sigma
-    remedy = "Put it on a flat plate."
-    twisted = f"two opposite corners stand {abs(twist):.3g} ± {twist_sigma:.1g} above its plane, the others below it"
-    if all(abs(v) < CLEAR * s for v, s in zip(bends, bend_sigmas, strict=True)):
-        return f"The board of the given points is twisted: {twisted} ({INDEPENDENT})", remedy
-    (x, y), (x_sigma, y_sigma) = bends, bend_sigmas
-    further = f"; it is twisted, too, {twisted}" if abs(twist) > CLEAR * twist_sigma else ""
-    return (
-        f"The board of the given points is not flat: its middle stands {x:.3g} ± {x_sigma:.1g} off along its first "
-        f"axis and {y:.3g} ± {y_sigma:.1g} along its second{further} ({INDEPENDENT})",
-        f'{remedy} Or let its bend be adjusted: board_bend = "free" under [object] in project.toml.',
-    )
-
-
-def _strain_words(count: int, found: Estimate) -> tuple[str, str]:
-    """Describe stretches and shears of a flat board (count 2) or of an object in space (3)."""
-    value, names = found.value, ("X", "Y", "Z") if count > 2 else ("its first axis", "its second")
-    middle = int(np.argsort([*value[: count - 1], 0.0])[(count - 1) // 2 if count > 2 else 1])
-    # Stretches relative to the axis in the middle.
-    stretches = np.vstack([np.eye(len(value))[: count - 1], np.zeros(len(value))])
-    rows = [
-        (stretches[i] - stretches[middle], 100.0, f"% {{}} along {names[i]} than along {names[middle]}")
-        for i in range(count)
-        if i != middle
-    ]
-    rows += [
-        (row, 1000.0, f"mrad off in the angle of {names[i]} and {names[j]}")
-        for row, (i, j) in zip(np.eye(len(value))[count - 1 :], combinations(range(count), 2), strict=True)
-    ]
-    changes = [(float(row @ value), np.sqrt(row @ found.covariance @ row), unit, what) for row, unit, what in rows]
-    significant = [each for each in changes if abs(each[0]) > CLEAR * each[1]] or changes
-    figures = " and ".join(
-        f"{abs(unit * v):.3g} ± {unit * s:.1g} {what.format('longer' if v > 0.0 else 'shorter')}"
-        for v, s, unit, what in significant
-    )
-    what = "board" if count == 2 else "object"
-    return (
-        f"The {what} of the given points has another shape than given: it is {figures}",
-        f"Measure the {what} and give the coordinates that it has: printers stretch paper in one direction.",
-    )
-
-
-def _is_given(network: Network) -> bool:
-    """Whether all points of an object are given, and enough to test its shape."""
-    return len(network.known_places) >= max(FEWEST_GIVEN, len(network.observed_points))
-
-
-def _flat_form(network: Network) -> BoardForm | None:
-    try:
-        return board_form(np.array(list(network.known_places.values())))
-    except ValueError:
-        return None
-
-
-def _of_targets(run: Run, by_point: Mapping[str, Array]) -> Array:
-    """(n, k, 3) displacements of the points of all targets, of those (k, 3) by name; 0 for others."""
-    none = np.zeros_like(next(iter(by_point.values())))
-    return np.array([by_point.get(name, none) for name in run.problem.network.observations.point])
-
-
-def _possible_radius(run: Run) -> float:
-    """Radius of disks: as given, or where it is not a quarter of the distance of neighbours."""
-    network = run.problem.network
-    if network.disk_radius is not None:
-        return network.disk_radius
-    xyz = np.array(list(network.known_places.values()))
-    nearest, _ = KDTree(xyz).query(xyz, 2)
-    return float(np.median(np.asarray(nearest)[:, 1])) / 4.0
-
-
-def _disks(run: Run) -> Iterator[ModelHypothesis]:
-    """Another squared radius of disks on a board than given, or one where nothing says that the points are disks."""
-    problem, state, network = run.problem, run.end.state, run.problem.network
-    given = network.disk_radius
-    form = _flat_form(network) if _is_given(network) and given != 0.0 else None
-    if form is None:
-        return
-    radius, at = _possible_radius(run), dict[tuple[int, int], Array]()
-    points = np.array([at for id_, at in problem.unknowns.point.items() if id_ in network.known_places])
-    shown = network.observations.has_kind("target")
-    for i, j in product((-1, 0, 1), repeat=2):
-        values = state.values.copy()
-        values[points] += radius * (np.array([i, j]) @ form.axes)
-        if (computed := computed_observations(problem, State(values, state.rotations))) is None:
-            return
-        at[i, j] = computed[shown]
-
-    def words(found: Estimate) -> tuple[str, str]:
-        sigma, diameter = found.sigma[0], 2.0 * np.sqrt(max((given or 0.0) ** 2 + found.value[0], 0.0))
-        figures = f"{diameter:.3g} ± {2.0 * sigma / max(diameter, np.sqrt(sigma)):.1g} (points' unit)"
-        if given is None:
-            return (
-                "The points are centres of dots, whose perspective is not corrected: their diameter is found as "
-                f"{figures}",
-                'Give their diameter_mm under [targets], kind = "disk".',
-            )
-        return (
-            f"The disks do not have the diameter of {2.0 * given:.4g} that is given, or the points another spacing: by "
-            f"the coordinates it is found as {figures}",
-            "Measure a disk, and from one to the next; correct diameter_mm or the coordinates and their unit.",
-        )
-
-    directions = np.zeros((len(shown), 1, 3))
-    directions[shown] = disk_directions(at, form.axes, radius)
-    limits = (-np.inf, np.inf) if given is not None else (0.0, (2.0 * radius) ** 2)
-    yield replace(displaced(run, "disks", "disks", words, directions), limits=limits)
-
-
-def diameter_notes(run: Run) -> Iterator[str]:
-    """Note where a wrong diameter of the disks, or one that is not given, changes c by more than its deviation."""
-    for each in _disks(run) if run.converged else ():
-        unknowns, (radius_squared,) = each.problem.unknowns, each.added
-        if (at := run.linearised(each.problem)) is None:
-            return
-        cofactor = free_cofactor(at)
-        given = run.problem.network.disk_radius
-        for camera, (c, *_) in unknowns.camera.items():
-            (own, common), (_, square) = cofactor.part(np.array([c, radius_squared]))
-            squared = _possible_radius(run) ** 2 if given is None else ((1.0 + MISMEASURED) ** 2 - 1.0) * given**2
-            change = squared * common / square
-            if abs(change) <= np.sqrt(own - common**2 / square):
-                continue
-            if given is not None:
-                yield (
-                    f"The diameter of the disks is taken as exact: if it is {100.0 * MISMEASURED:.0f} % larger, c of "
-                    f"camera {camera} changes by {change:+.2g} mm."
-                )
-            elif squared - at.factor.solution[at.rows.numbering.numbers[radius_squared]] < CLEAR * np.sqrt(square):
-                yield (
-                    "Nothing says whether the points are corners or the centres of dots: if they are dots of a "
-                    f"diameter of {2.0 * np.sqrt(squared):.2g} (points' unit), whose perspective is not corrected, c "
-                    f"of camera {camera} changes by {change:+.2g} mm. Give their diameter_mm under [targets], kind = "
-                    '"disk".'
-                )
-
-
-def _wrong_points(run: Run, most: int) -> Iterator[ModelHypothesis]:
-    """Wrong coordinates of fixed points, heights alone, say, or of a line or a side of a regular field by one shift.
-
-    Coordinates that are given with a standard deviation are observations, tested by data snooping.
-    """
-    network, unknowns, fixed = run.problem.network, run.problem.unknowns, _fixed_coordinates(run)
-    if len(fixed) < FEWEST_GIVEN:
-        return
-    positions = np.concatenate([unknowns.point[name][mask] for name, mask in fixed.items()])
-    form = _flat_form(network) if network.known_places else None
-    axes = np.eye(3) if form is None else form.axes
-    for selection in displaced_points(run, axes, continued_with(run, positions), fixed, most):
-        mask = np.array([fixed[name] for name in selection.names])
-        added = np.array([unknowns.point[name] for name in selection.names])[mask]
-        words = _point_words(selection, mask, unknowns.given[added], len(fixed))
-        if selection.words:
-            moved = _of_targets(run, dict.fromkeys(selection.names, np.eye(3)))
-            found = displaced(run, "group", "point", words, moved)
-        else:
-            found = ModelHypothesis("point", words, continued_with(run, added), added)
-        yield replace(found, selection=selection)
-
-
-def _fixed_coordinates(run: Run) -> dict[str, Mask]:
-    """Mask (3,) of the fixed coordinates of each point that has some, and that FEWEST_IMAGES show."""
-    network = run.problem.network
-    images = Counter(name for name, _ in set(zip(network.observations.point, network.observations.image, strict=True)))
-    fixed = {
-        name: np.array([prior is not None and prior.sigma == 0.0 for prior in network.point_by_id[name].priors])
-        for name in run.problem.unknowns.point
-        if images[name] >= FEWEST_IMAGES
-    }
-    return {name: mask for name, mask in fixed.items() if mask.any()}
-
-
-def wrong_points(earlier: ModelHypothesis | None, found: ModelHypothesis, run: Run) -> ModelHypothesis:
-    """Wrong single points as estimated in a run, with those of an earlier round, without those where they are given.
-
-    Other hypotheses are returned as they are.
-    """
-    rounds = [each for each in (earlier, found) if each and each.kind == "point" and not each.selection.words]
-    if found not in rounds:
-        return found
-    unknowns, cofactor, wrong = found.problem.unknowns, free_cofactor(run.end), list[tuple[str, Mask, Indices]]()
-    for each in rounds:
-        for name in each.selection.names:
-            mask = np.isin(each.problem.unknowns.point[name], each.added if each.shown is None else each.shown)
-            at = unknowns.point[name][mask]
-            off = run.end.state.values[at] - unknowns.given[at]
-            if chdtrc(len(at), off @ np.linalg.solve(cofactor.part(at), off)) < LEVEL:
-                wrong.append((name, mask, at))
-    if not wrong:
-        return found
-    names, masks, positions = zip(*wrong, strict=True)
-    added, selection = np.concatenate(positions), replace(found.selection, names=names)
-    words = _point_words(selection, np.array(masks), unknowns.given[added], len(_fixed_coordinates(run)))
-    return replace(found, words=words, shown=added, selection=selection)
-
-
-def _point_words(selection: Selection, fixed: Mask, given: Array, count: int) -> Words:
-    """Words on points whose fixed coordinates (k, 3) are not those given (n,), or on a group with one shift.
-
-    count: of the points with fixed coordinates.
-    """
-    names, remedy = selection.names, "Correct the coordinates of these points, or their numbers among the marks."
-
-    def words(found: Estimate) -> tuple[str, str]:
-        offs, sigmas = np.zeros((2, *fixed.shape))
-        if selection.words:
-            offs, sigmas = -found.value[None], found.sigma[None]
-        else:
-            offs[fixed], sigmas[fixed] = given - found.value, found.sigma
-        by = [_axes_words(*each) for each in zip(offs, sigmas, strict=True)]
-        some = shortened(names, MOST_NAMED)
-        if selection.words:
-            return (
-                f"The points {some} ({selection.words}) are not where they are given: all their coordinates are off, "
-                f"{by[0]} (points' unit)",
-                remedy,
-            )
-        if len(names) == 1:
-            return (
-                f"Point {names[0]} is not where it is given: its coordinates are off, {by[0]} (points' unit)",
-                "Correct the coordinates of this point, or its number among the marks.",
-            )
-        if fixed.all() and (common := _common_shift(offs, found.covariance)):
-            return (
-                f"{len(names)} points are not where they are given: {some}; all are off by the same shift, "
-                f"{_axes_words(*common)} (points' unit)",
-                remedy,
-            )
-        if 2 * len(names) > count:
-            return (
-                f"{len(names)} of {count} points that are given as exact are not where they are given, by "
-                f"{np.sqrt(np.mean(offs[fixed] ** 2)):.2g} rms (points' unit): their coordinates are not exact",
-                "Give sX, sY and sZ as the points have them.",
-            )
-        worst = np.argsort(-np.linalg.norm(offs, axis=1), kind="stable")[:NAMED]
-        return (
-            f"{len(names)} points are not where they are given: {some}; the coordinates of the worst are off, "
-            f"{'; '.join(f'{names[k]}: {by[k]}' for k in worst)} (points' unit)",
-            remedy,
-        )
-
-    return words
-
-
-def _axes_words(off: Array, sigma: Array) -> str:
-    """Errors (3,) of coordinates with their standard deviations, 0 for those that are not tested."""
-    digits = [max(0, -int(np.floor(np.log10(max(s, 1e-12))))) for s in sigma]
-    rows = zip("XYZ", off, sigma, digits, strict=True)
-    return ", ".join(f"{axis} by {d:+.{n}f} ± {s:.1g}" for axis, d, s, n in rows if s > 0.0)
-
-
-def _common_shift(offs: Array, covariance: Array) -> tuple[Array, Array] | None:
-    """Weighted mean (3,) of the shifts (k, 3) of points, and its standard deviations; None where they differ."""
-    count = len(offs)
-    weight, same = np.linalg.inv(covariance), np.tile(np.eye(3), (count, 1))
-    of_mean = np.linalg.inv(same.T @ weight @ same)
-    mean = of_mean @ (same.T @ weight @ offs.ravel())
-    rest = (offs - mean).ravel()
-    if count < FEWEST_ALIKE or chdtrc(3 * (count - 1), rest @ weight @ rest) < LEVEL:
-        return None
-    return mean, np.sqrt(np.diag(of_mean))

@@ -20,7 +20,7 @@ from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.lens import INTERIOR_NAMES
 from adjust.problem.problem import Problem
 from adjust.quality.cofactor import image_equations
-from adjust.quality.run import Run, derivatives_by
+from adjust.quality.run import Run, derivatives_of
 
 FLAT = 1e-9  # fraction of the largest eigenvalue below which a direction is undetermined
 MOST_TURNS = 20  # iterations of two-means
@@ -84,7 +84,7 @@ def two_groups(run: Run, camera: str, equations: InteriorEquations) -> Selection
     interior = run.end.state.values[run.problem.unknowns.camera[camera][: len(INTERIOR_NAMES)]]
     along = np.vstack([np.eye(3), interior / np.linalg.norm(interior)])  # c, x0', y0', scale of the whole image
     single = (right @ along.T) / np.maximum(np.einsum("di,mij,dj->md", along, normal, along), 1e-300)
-    starts = [_threshold(normal, right, change) for change in np.hstack([_solved(normal, right), single]).T]
+    starts = [_threshold(normal, right, change) for change in np.hstack([_pseudo_solve(normal, right), single]).T]
 
     def fall(mask: Mask) -> float:
         return float(sum(quadratic(normal[some].sum(axis=0), right[some].sum(axis=0)) for some in (mask, ~mask)))
@@ -129,7 +129,7 @@ def _threshold(normal: Array, right: Array, change: Array) -> Mask:
 
 def _two_means(normal: Array, right: Array, mask: Mask) -> Mask:
     for _ in range(MOST_TURNS):
-        changes = [_solved(normal[some].sum(axis=0), right[some].sum(axis=0)) for some in (mask, ~mask)]
+        changes = [_pseudo_solve(normal[some].sum(axis=0), right[some].sum(axis=0)) for some in (mask, ~mask)]
         own, other = (right @ change - 0.5 * ((normal @ change) @ change) for change in changes)
         moved = own > other
         if (moved == mask).all() or moved.all() or not moved.any():
@@ -141,7 +141,7 @@ def _two_means(normal: Array, right: Array, mask: Mask) -> Mask:
 def _scatter_probability(normal: Array, right: Array, mask: Mask) -> float:
     """p-value of the partition's clearness along the difference of its groups, by simulation of normal scatter."""
     # The variance between images is that of DerSimonian and Laird's method of moments (1986).
-    one, other = (_solved(normal[some].sum(axis=0), right[some].sum(axis=0)) for some in (mask, ~mask))
+    one, other = (_pseudo_solve(normal[some].sum(axis=0), right[some].sum(axis=0)) for some in (mask, ~mask))
     weight = np.einsum("i,mij,j->m", one - other, normal, one - other)
     known = weight > 0.0
     weight, change = weight[known], (right @ (one - other))[known] / weight[known]
@@ -215,7 +215,7 @@ def displaced_points(
     # N (p, 3, p, 3) and g (p, 3), the unknowns of the run eliminated; 0 for coordinates that are not fixed.
     positions = np.concatenate([problem.unknowns.point[name] for name in names])
     is_fixed = diags_array(np.concatenate([*fixed.values()]) * 1.0)
-    by_points = derivatives_by(problem, at.rows.matrix, positions) @ is_fixed
+    by_points = derivatives_of(problem, at.rows.matrix, positions) @ is_fixed
     across = (run.unit_functions[: by_points.shape[0]].T @ by_points).toarray()
     normal = (by_points.T @ by_points).toarray() - across.T @ run.factor.cofactor_times(across)
     normal, right = normal.reshape(count, 3, count, 3), (by_points.T @ at.rows.right.ravel()).reshape(count, 3)
@@ -278,9 +278,9 @@ def _lines(xyz: Array, axes: Array) -> Iterator[tuple[str, Mask]]:
 
 def quadratic(normal: Array, right: Array) -> Array:
     """g' N⁻¹ g of one system (k, k), (k,) or of many."""
-    return np.asarray((right * _solved(normal, right)).sum(axis=-1))
+    return np.asarray((right * _pseudo_solve(normal, right)).sum(axis=-1))
 
 
-def _solved(normal: Array, right: Array) -> Array:
+def _pseudo_solve(normal: Array, right: Array) -> Array:
     """N⁻¹ g of one system (k, k), (k,) or of many."""
     return np.asarray((np.linalg.pinv(normal, rcond=FLAT, hermitian=True) @ right[..., None])[..., 0])

@@ -85,7 +85,7 @@ def plan(network: Network, values: Approximations, options: Options | None = Non
     singular = result.singular
     null = np.zeros((len(problem.unknowns), 0))
     if singular:
-        held, null = _regularised(settle_datum(problem, options))
+        held, null = _regularise(settle_datum(problem, options))
         result = adjust_problem(problem, options, held)
     own = reduction.inverse.network(result.network)
     adjusted = reduction.unreduced_values(problem.unknowns, result.values, own)
@@ -94,7 +94,7 @@ def plan(network: Network, values: Approximations, options: Options | None = Non
     return Plan(expected, sigma0, singular, null)
 
 
-def _regularised(problem: Problem) -> tuple[list[int], Array]:
+def _regularise(problem: Problem) -> tuple[list[int], Array]:
     """Positions of unknowns that make a singular problem regular when held, and its null vectors (n, d)."""
     # The pivots of the null vectors are held, one for each: minimal constraints of the free unknowns.
     held: list[int] = []

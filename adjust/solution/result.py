@@ -47,8 +47,8 @@ from adjust.quality.variance_components import factor_sigmas, variance_factor
 from adjust.rank_defect import datum
 from adjust.rank_defect.diagnosis import held_directions, inseparable
 from adjust.solution.explanations import Explanation, explain
-from adjust.solution.model_hypotheses import diameter_notes
 from adjust.solution.options import Options
+from adjust.solution.point_hypotheses import diameter_notes
 from adjust.solution.reweighting import again, run
 from adjust.solution.warnings import curved_valley_warnings, film_scale_notes, held_decentering_notes, run_warnings
 
@@ -450,7 +450,7 @@ def _center_datum(problem: Problem, last: Run, members: Indices, options: Option
     for _ in range(datum.CENTERINGS):
         if not last.converged:
             return last
-        state, before = datum.centered(problem, last.end.state, members), last
+        state, before = datum.center_datum(problem, last.end.state, members), last
         if np.abs(state.values - before.end.state.values)[members].max(initial=0.0) <= datum.EXACT * extent:
             break
         last = again(before, before.weighting, options.iteration_limit, state)

@@ -18,7 +18,7 @@ from adjust.quality.critical_values import NO_WEIGHT, TestedUnits, WeightFunctio
 from adjust.quality.reliability import Snooping
 from adjust.quality.run import GrossError, Run
 from adjust.quality.variance_components import refined_factors
-from adjust.rank_defect.diagnosis import REACHES, edge_motions, is_contradicted, singular_directions, unresolved
+from adjust.rank_defect.diagnosis import REACHES, edge_motions, is_contradicted, singular_directions, unresolved_motions
 from adjust.solution.options import Options
 
 ROUNDS = 30  # largest number of rounds of robust estimation, variance components or data snooping
@@ -155,7 +155,7 @@ def _release_cameras(problem: Problem, weighting: Weighting, begun: Run, limit: 
     for reach in REACHES if motions else ():
         held = replace(problem, pseudo_observed={i: reach * motion for i, motion in motions.items()})
         at = begun.linearised(held, start)
-        if at is None or not unresolved(held.pseudo_observed, free_cofactor(at).variances):
+        if at is None or not unresolved_motions(held.pseudo_observed, free_cofactor(at).variances):
             break
         last = _iterate(held, weighting, state, limit)
         if last.converged and not is_contradicted(held, last.end.state):
@@ -169,16 +169,16 @@ def _alike_at_zero(problem: Problem, state: State, with_others: bool = False) ->
     """Free distortion parameters by camera that are 0, and then have the derivatives of other parameters. with_others:
     those too that could be and are not."""
     unknowns, found = problem.unknowns, {}
-    for camera, positions in unknowns.camera.items():
-        of = family(problem.network.camera_by_name[camera].distortion.family)
-        alike = [int(positions[3 + of.parameters.index(each)]) for each in of.alike_at_zero]
-        free = [at for at in alike if np.isinf(unknowns.sigma[at])]
+    for camera in unknowns.camera:
+        positions = problem.lens_positions(camera)
+        alike = family(problem.network.camera_by_name[camera].distortion.family).alike_at_zero
+        free = [positions[each] for each in alike if np.isinf(unknowns.sigma[positions[each]])]
         found[camera] = [at for at in free if with_others or state.values[at] == 0.0]
     return found
 
 
 def _iterate(problem: Problem, weighting: Weighting, state: State, limit: int) -> Run:
-    weighted, covariance = weighting.applied(problem)
+    weighted, covariance = weighting.apply(problem)
     numbering = Numbering(weighted)
 
     def singular_at(at: Linearised) -> tuple[NullDirection, ...]:

@@ -28,7 +28,7 @@ from adjust.quality.cofactor import free_cofactor
 from adjust.quality.run import Residuals, Run
 from adjust.rank_defect.diagnosis import loose_principal_distances, singular_directions, undetermined, weak_directions
 from adjust.rank_defect.directions import weak_term_sentences
-from adjust.solution.model_hypotheses import continued_with
+from adjust.solution.model_hypotheses import free_and_continue
 from adjust.solution.reweighting import ROUNDS, again
 
 GROSS = 20.0  # in a-priori standard deviations: a larger residual may come from a confused mark
@@ -36,7 +36,7 @@ COPIED = 0.001  # significance level, for all pairs of images, of marks that lie
 NEARER = 0.25  # fraction of the distance of two marks: largest offset of one from the other's expected place
 NAMED = 5  # images named in a warning
 UNCHECKED = 1e-6  # redundancy of all targets of an image below which its orientation is unchecked
-# Ratios of standard deviations with decentering free and held at 0, above which it is told: where the images suggest
+# Ratios of standard deviations with decentering free and held at 0, above which it is reported: where images suggest
 # decentering, and always.
 WORSE, MUCH_WORSE = 2.0, 5.0
 SUGGESTED = 0.05  # p-value of decentering distortion that the images suggest
@@ -234,16 +234,16 @@ def _cross(observed_mm: Array, expected_mm: Array, i: int, j: int) -> bool:
 def held_decentering_notes(run: Run, cofactor: Cofactor) -> Iterator[str]:
     """Note where the principal point depends on decentering distortion that is held at 0."""
     for camera in run.problem.network.cameras:
-        of = family(camera.distortion.family)
-        terms = dict(of.groups).get("decentering", ())[:2]
+        lens_family = family(camera.distortion.family)
+        terms = dict(lens_family.groups).get("decentering", ())[:2]
         positions = run.problem.unknowns.camera.get(camera.name)
         if positions is None or not terms:
             continue
-        point, added = positions[1:3], positions[[3 + of.parameters.index(name) for name in terms]]
+        point, added = positions[1:3], positions[[3 + lens_family.parameters.index(name) for name in terms]]
         sigma = run.numbering.problem.prior_sigma
         if sigma[added].any() or not sigma[point].all():
             continue
-        if (at := run.linearised(continued_with(run, added))) is None:
+        if (at := run.linearised(free_and_continue(run, added))) is None:
             continue
         variances, p = np.full(2, np.inf), 0.0
         if not singular_directions(at.rows.numbering, at.state, at.factor):

@@ -31,18 +31,18 @@ _COARSE_CELLS = 60  # cells of the density table along each side
 _CROWD = 6  # nearest marks from which the local density is estimated
 _ROUNDS = 25  # of assignment and adjustment in turns
 _GATE_SIGMAS = 3.5  # distance of a mark from a prediction, above which it is another's
-_MOST_CHANCE = 0.1  # largest probability of a random mark in a point's gate; otherwise not identified yet
+_MOST_PROBABLE = 0.1  # largest probability of a random mark in a point's gate; otherwise not identified yet
 _PRIOR_RADIAL = 0.1  # standard deviation of k1: 10 % of the radius for rays at 45 degrees
 _ROBUST = 2.0  # in standard deviations, limit of Huber's weight function
 _BEFORE = -1e-6  # z of a point before the camera, in units of its distance
 OF_POSE = 3  # points that agree with some pose whatever they are
 LEAST_POINTS = 5
-MOST_LOG10_CHANCE = -6.0
+MOST_LOG10_FALSE_ALARMS = -6.0
 LEAST_SHARE = 0.4  # fraction of the expected points that must be identified
 ALIKE_SHARE = 0.7  # fraction of the identified marks above which an alternative may be as good
-TOLD_LOG10 = 6.0  # log10 of the likelihood ratio that decides between two identifications
+DISTINCT_LOG10 = 6.0  # log10 of the likelihood ratio that decides between two identifications
 MOST_POSES = 1_000_000  # largest number of poses tried, to limit the time
-MOST_LOG10_CHANCE_OF_CODES = -3.0  # for agreeing codes; a weaker limit, since few hypotheses are tested
+MOST_LOG10_FALSE_ALARMS_OF_CODES = -3.0  # for agreeing codes; a weaker limit, since few hypotheses are tested
 LEAST_CODES = 4  # three always agree with some pose
 KNOWN_SIGMA = 0.05  # relative standard deviation of a known principal distance
 # Unknown principal distance, in diagonals of the frame, usual ones first; the largest error is a factor of 1.41:
@@ -108,7 +108,7 @@ class Marks:
         """Nearest mark of each place (..., 2), to the resolution of the look-up table."""
         return self._nearest_of_cell[self._cell(places, _CELLS)]
 
-    def chance(self, places: Array, reach: Array) -> Array:
+    def probability(self, places: Array, reach: Array) -> Array:
         """Probability of a mark within reach (...) of places (..., 2), for random marks of this density (Poisson)."""
         density = self._density_of_cell[self._cell(places, _COARSE_CELLS)]
         return np.asarray(-np.expm1(-density * np.pi * np.square(reach)))
@@ -162,7 +162,7 @@ class Grown:
     mark: dict[int, int] = field(default_factory=dict)  # mark of each identified point
     gate: float = 0.0  # largest distance of a mark from the predicted place of its point, in principal distances
     expected: int = 0  # number of points that the frame should show
-    log10_chance: float = 0.0  # log10 of the expected number of false alarms over all possible hypotheses
+    log10_false_alarms: float = 0.0  # log10 of the expected number of false alarms over all possible hypotheses
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +187,7 @@ class Names:
     principal_distance_mm: float
     radial: float
     expected: int  # number of points that the image should show
-    log10_chance: float  # log10 of the expected number of false alarms
+    log10_false_alarms: float  # log10 of the expected number of false alarms
     gate_mm: float  # largest distance of a mark from the predicted place of its point
 
 
@@ -234,28 +234,28 @@ def name_marks(
 
 def _named_by_pattern(searches: Sequence["_Search"]) -> Names | str:
     """Take the first accepted identification, the most significant one of several principal distances."""
-    most = MOST_LOG10_CHANCE - np.log10(len(searches))
-    believed: list[tuple[_Search, Grown]] = []
+    most = MOST_LOG10_FALSE_ALARMS - np.log10(len(searches))
+    accepted: list[tuple[_Search, Grown]] = []
     tried = 0
     for cluster in searches[0].clusters:  # those that need the fewest trials come first
         for search in searches:
             grown, count = search.grown(cluster.triple[None], mark_triples(cluster, search.marks))
             tried += count
-            if grown and grown[0].log10_chance < most:
-                believed.append((search, grown[0]))
-        if believed or tried > MOST_POSES * len(searches):
+            if grown and grown[0].log10_false_alarms < most:
+                accepted.append((search, grown[0]))
+        if accepted or tried > MOST_POSES * len(searches):
             break
-    if not believed:
+    if not accepted:
         n, m = len(searches[0].xyz), len(searches[0].marks.places)
         return f"the {m} marks found do not make the pattern that the {n} points would from any side"
-    search, found = min(believed, key=lambda one: one[1].log10_chance)
+    search, found = min(accepted, key=lambda one: one[1].log10_false_alarms)
     others = search.others(found)
-    best = min([found, *others], key=attrgetter("log10_chance"))
+    best = min([found, *others], key=attrgetter("log10_false_alarms"))
     for other in others if best is found else [found, *search.others(best)]:
         # The number of marks alone does not decide: for a grid shifted by one step, the points lost at one end may be
         # as many as those missed by chance.
         closer = 2 * len(other.mark) * np.log10(other.gate / best.gate)  # likelihood of two coordinates each
-        if len(other.mark) >= ALIKE_SHARE * len(best.mark) and closer < TOLD_LOG10:
+        if len(other.mark) >= ALIKE_SHARE * len(best.mark) and closer < DISTINCT_LOG10:
             return (
                 f"the points look the same from another side, or moved on, as a regular grid does: {len(best.mark)} "
                 f"marks agree with one naming, {len(other.mark)} with another one, and about as closely"
@@ -274,14 +274,14 @@ def _named_by_codes(searches: Sequence["_Search"], codes: Mapping[int, int]) -> 
             continue
         view, agree = View(found.pose.rotation, -found.pose.rotation @ found.pose.center), found.inliers
         grown = grow(view, points[agree], coded[agree], search.xyz, search.normals, marks)
-        chance = min(np.pi * (2.0 * grown.gate) ** 2 / float(np.prod(marks.greatest - marks.least)), 1.0)
+        probability = min(np.pi * (2.0 * grown.gate) ** 2 / float(np.prod(marks.greatest - marks.least)), 1.0)
         right = sum(grown.mark.get(point) == mark for mark, point in codes.items())
-        grown = replace(grown, log10_chance=log10_of_chance(right, len(codes), chance, tests))
+        grown = replace(grown, log10_false_alarms=log10_false_alarms_of(right, len(codes), probability, tests))
         candidates.append((search, grown, right))
     if not candidates:
         return f"the {len(codes)} coded targets recognised lie on one line and do not orient the image"
-    search, best, right = min(candidates, key=lambda one: one[1].log10_chance)
-    if best.log10_chance + np.log10(len(searches)) > MOST_LOG10_CHANCE_OF_CODES:
+    search, best, right = min(candidates, key=lambda one: one[1].log10_false_alarms)
+    if best.log10_false_alarms + np.log10(len(searches)) > MOST_LOG10_FALSE_ALARMS_OF_CODES:
         return f"{right} of the {len(codes)} coded targets recognised fit their points, which may be a false alarm"
     numbers = set(codes.values())
     named = {
@@ -316,7 +316,7 @@ class _Search:
         view, c = found.view, self.marks.c
         pose = Pose(view.rotation, self.origin - self.size * view.rotation.T @ view.shift)
         of_view = pose, c * (1.0 + view.scale), view.radial
-        return Names(found.mark, *of_view, found.expected, found.log10_chance, found.gate * c)
+        return Names(found.mark, *of_view, found.expected, found.log10_false_alarms, found.gate * c)
 
     def grown(self, points: Indices, named: Indices) -> tuple[list[Grown], int]:
         """Identifications of enough marks, the most significant first, from three points (k or 1, 3) matched to three
@@ -324,7 +324,7 @@ class _Search:
         starts, tried = promising(self.xyz, self.normals, self.marks, points, named)
         grown = [grow(*start, self.xyz, self.normals, self.marks) for start in starts]
         enough = [one for one in grown if len(one.mark) >= LEAST_SHARE * one.expected and len(one.mark) >= LEAST_POINTS]
-        return sorted(enough, key=attrgetter("log10_chance")), tried
+        return sorted(enough, key=attrgetter("log10_false_alarms")), tried
 
     def others(self, found: Grown) -> list[Grown]:
         """Alternative identifications of the image: identified clusters matched to other points."""
@@ -424,29 +424,29 @@ def promising(xyz: Array, normals: Array, marks: Marks, points: Indices, named: 
     for start in range(0, count, _CHUNK):
         rows = np.arange(start, min(start + _CHUNK, count))
         own, own_marks = _rows(points, rows), _rows(named, rows)
-        rotations, shifts, of = triple_poses(xyz[own], marks.places[own_marks])
-        tried += len(of)
+        rotations, shifts, triple = triple_poses(xyz[own], marks.places[own_marks])
+        tried += len(triple)
         stations = -np.einsum("kji,kj->ki", rotations, shifts)
-        towards = np.einsum("kpi,kpi->kp", normals[own[of]], stations[:, None] - xyz[own[of]])
+        towards = np.einsum("kpi,kpi->kp", normals[own[triple]], stations[:, None] - xyz[own[triple]])
         facing = ~(towards <= 0.0).any(axis=1)  # all three points; unknown directions count as facing
-        rotations, shifts, of = rotations[facing], shifts[facing], of[facing]
-        anchors = marks.places[own_marks[of]].mean(axis=1)
-        evidence, _, _ = _tested(rotations, shifts, xyz[_rows(about, rows)[of]], anchors, marks, _REACH)
+        rotations, shifts, triple = rotations[facing], shifts[facing], triple[facing]
+        anchors = marks.places[own_marks[triple]].mean(axis=1)
+        evidence, _, _ = _test_poses(rotations, shifts, xyz[_rows(about, rows)[triple]], anchors, marks, _REACH)
         best = np.argsort(-evidence, kind="stable")[:_KEPT]
-        kept.append((rotations[best], shifts[best], rows[of[best]], evidence[best]))
-    rotations, shifts, of, evidence = (np.concatenate(part) for part in zip(*kept, strict=True))
+        kept.append((rotations[best], shifts[best], rows[triple[best]], evidence[best]))
+    rotations, shifts, triple, evidence = (np.concatenate(part) for part in zip(*kept, strict=True))
     best = np.argsort(-evidence, kind="stable")[:_KEPT]
-    rotations, shifts, of = rotations[best], shifts[best], of[best]
-    own, own_marks = _rows(points, of), _rows(named, of)
+    rotations, shifts, triple = rotations[best], shifts[best], triple[best]
+    own, own_marks = _rows(points, triple), _rows(named, triple)
     anchors = marks.places[own_marks].mean(axis=1)
     for count_about, reach in ((_ABOUT, _REACH), (_FARTHER, _LATER_REACH)):
-        ring = _rows(_nearest_points(xyz, points, count_about), of)
-        _, nearest, hit = _tested(rotations, shifts, xyz[ring], anchors, marks, reach)
+        ring = _rows(_nearest_points(xyz, points, count_about), triple)
+        _, nearest, hit = _test_poses(rotations, shifts, xyz[ring], anchors, marks, reach)
         fitted = np.concatenate([own, ring], axis=1), np.concatenate([own_marks, nearest], axis=1)
         weights = np.concatenate([np.ones(own.shape), hit], axis=1)
         rotations, shifts = refined_poses(rotations, shifts, xyz[fitted[0]], marks.places[fitted[1]], weights)
-    ring = _rows(_nearest_points(xyz, points, _FARTHER), of)
-    evidence, nearest, hit = _tested(rotations, shifts, xyz[ring], anchors, marks, _LATER_REACH)
+    ring = _rows(_nearest_points(xyz, points, _FARTHER), triple)
+    evidence, nearest, hit = _test_poses(rotations, shifts, xyz[ring], anchors, marks, _LATER_REACH)
     best = np.argsort(-evidence, kind="stable")[:_RETURNED]
     starts: list[Start] = []
     for i in best:
@@ -469,7 +469,7 @@ def _nearest_points(xyz: Array, points: Indices, count: int) -> Indices:
     return np.asarray(np.take_along_axis(near, order, axis=1), dtype=np.intp)
 
 
-def _tested(
+def _test_poses(
     rotations: Array, shifts: Array, points: Array, anchors: Array, marks: Marks, reach: float
 ) -> tuple[Array, Indices, Mask]:
     """Log-likelihood ratios (k,) of poses; for each of the points (k, p, 3) the nearest mark and whether it agrees."""
@@ -478,8 +478,8 @@ def _tested(
     nearest = marks.nearest(places)
     gate = _NOISE * marks.sigma + reach * np.linalg.norm(places - anchors[:, None], axis=2)
     hit = np.linalg.norm(places - marks.places[nearest], axis=2) <= gate
-    chance = np.clip(marks.chance(places, gate), 1e-9, _DETECTED)
-    gain = np.where(hit, np.log(_DETECTED / chance), np.log((1.0 - _DETECTED) / (1.0 - chance)))
+    probability = np.clip(marks.probability(places, gate), 1e-9, _DETECTED)
+    gain = np.where(hit, np.log(_DETECTED / probability), np.log((1.0 - _DETECTED) / (1.0 - probability)))
     return np.where(marks.inside(places), gain, 0.0).sum(axis=1), nearest, hit & marks.inside(places)
 
 
@@ -503,10 +503,12 @@ def grow(view: View, points: Indices, named: Indices, xyz: Array, normals: Array
     if agreeing <= OF_POSE:
         return Grown(view)
     # A pose fitted to all points may differ by the gate from that of three points: twice the gate.
-    chance = float(marks.chance(view.images(xyz[shown]), np.full(len(shown), 2.0 * gate)).mean())
-    log10_chance = log10_of_chance(agreeing, len(shown), chance, (float(len(xyz)) * len(marks.places)) ** OF_POSE)
+    probability = float(marks.probability(view.images(xyz[shown]), np.full(len(shown), 2.0 * gate)).mean())
+    log10_false_alarms = log10_false_alarms_of(
+        agreeing, len(shown), probability, (float(len(xyz)) * len(marks.places)) ** OF_POSE
+    )
     mark = dict(zip(points.tolist(), named.tolist(), strict=True))
-    return Grown(view, mark, gate, len(shown), log10_chance)
+    return Grown(view, mark, gate, len(shown), log10_false_alarms)
 
 
 def _near(
@@ -517,7 +519,7 @@ def _near(
     places, by = view.images(xyz[shown]), view.derivatives(xyz[shown])
     predicted = np.einsum("nij,jk,nik->ni", by, covariance, by).sum(axis=1)
     gate = _GATE_SIGMAS * np.sqrt(sigma**2 + predicted)
-    plain = marks.chance(places, gate) < _MOST_CHANCE
+    plain = marks.probability(places, gate) < _MOST_PROBABLE
     shown, places, gate = shown[plain], places[plain], gate[plain]
     if not len(shown):
         return shown, shown
@@ -567,11 +569,11 @@ def _fit_view(view: View, xyz: Array, places: Array, marks: Marks) -> tuple[View
     return view, sigma, covariance
 
 
-def log10_of_chance(agreeing: int, expected: int, chance: float, tests: float) -> float:
+def log10_false_alarms_of(agreeing: int, expected: int, probability: float, tests: float) -> float:
     """log10 of the expected number of poses with so many agreeing points under the null hypothesis (binomial).
 
     Three of the points always agree, with up to four poses for each of the possible tests.
     """
     with np.errstate(divide="ignore"):  # underflow gives -inf
-        of_pose = float(np.log10(bdtrc(agreeing - OF_POSE - 1, expected - OF_POSE, chance)))
+        of_pose = float(np.log10(bdtrc(agreeing - OF_POSE - 1, expected - OF_POSE, probability)))
     return of_pose + float(np.log10(4.0 * tests))

@@ -5,7 +5,7 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 
@@ -93,11 +93,11 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     """
     options = adjustment_options(project.adjust)
     adjusted = partial(adjust, options=options)
-    misnamed, notes = _misnamed(project, marks), _notes(project, marks)
+    misnamed, notes = _misspelt_names(project, marks), _notes(project, marks)
     if project.disk_radius > 0.0:
         target_field.check_spacing(project, target_field.target_field(project))
     network, left_out = build_network(project, marks)
-    network, untold = add_scanner_bends(project, network, adjusted)
+    network, bend_remarks = add_scanner_bends(project, network, adjusted)
     pitch_um = project.pitch_um or project.list_pitch_um
     is_digital = all(image.transformation == "none" for image in network.images)
     pixel_mm = float(np.mean(pitch_um)) / 1000.0 if is_digital and pitch_um else None
@@ -109,20 +109,14 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     if project.disk_radius > 0.0:
         adjustment, uncorrected = _correct_eccentricity(project, first, options)
     alike = _alike_names(project, marks)
-    remarks = (*adjustment.remarks, *left_out, *untold, *misnamed, *alike, *uncorrected)
+    remarks = (*adjustment.remarks, *left_out, *bend_remarks, *misnamed, *alike, *uncorrected)
     return replace(adjustment, unmodelled_mm=first.unmodelled_mm, remarks=remarks, unused=notes)
 
 
 def adjustment_options(settings: AdjustSettings) -> Options:
-    return Options(
-        datum=settings.datum,
-        datum_coordinates=settings.datum_coordinates,
-        datum_points=settings.datum_points,
-        robust=settings.robust,
-        variance_components=settings.variance_components,
-        snooping=settings.snooping,
-        method=settings.method,
-    )
+    """Options of the adjustment from the settings of the same names."""
+    names = {field.name for field in fields(Options)}
+    return Options(**{name: value for name, value in vars(settings).items() if name in names})
 
 
 def _correct_eccentricity(
@@ -143,7 +137,7 @@ def _correct_eccentricity(
             break
         shifted = replace(adjustment.network, observations=replace(observations, xy_mm=measured_mm - wanted))
         corrected = adjust(shifted, options=options)
-        kept = _rows_of(observations, corrected.network.observations)
+        kept = _matching_rows(observations, corrected.network.observations)
         measured_mm, applied = measured_mm[kept], wanted[kept]
         adjustment = replace(corrected, left_out={**adjustment.left_out, **corrected.left_out})
     worst = float(np.max(np.abs(uncorrected) / sigmas_mm, initial=0.0))
@@ -157,7 +151,7 @@ def _correct_eccentricity(
     return adjustment, (remark,)
 
 
-def _rows_of(observations: Observations, some: Observations) -> list[int]:
+def _matching_rows(observations: Observations, some: Observations) -> list[int]:
     """Rows of some of the observations."""
     rows = {
         mark: row
@@ -191,7 +185,7 @@ def _eccentricities(adjustment: Adjustment, given: Mapping[str, Array], radius: 
     return known_part, unknown_part
 
 
-def _misnamed(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, ...]:
+def _misspelt_names(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[str, ...]:
     """Warning of a probably misspelt name: some images have no line in images.csv, and some lines no image."""
     if project.given_images is None:
         return ()

@@ -299,7 +299,7 @@ def _cameras(
             center = (xy.min(axis=0) + xy.max(axis=0)) / 2 if file.principal_point_mm is None else np.zeros(2)
             camera = file.camera((float(center[0]), float(center[1])))
             if file.calibration is not None:
-                camera, calibration = file.calibration.applied(camera)
+                camera, calibration = file.calibration.apply_to(camera)
                 calibrations.append(calibration)
             cameras.append(camera)
     return tuple(cameras), tuple(calibrations)

@@ -27,7 +27,7 @@ _SEARCH_PX = 2.0  # search radius: predictions of an adjusted orientation are fa
 
 
 @dataclass(frozen=True, eq=False)
-class SearchedAgain:
+class RepeatedSearch:
     """Scan to be searched again.
 
     scan: path or address of its file; sought: predictions of the missed targets.
@@ -60,35 +60,35 @@ def measure_again(
     xyz = field.xyz.copy()
     xyz[known] = adjusted_places(adjustment, [field.ids[row] for row in known])
     field = replace(field, xyz=xyz)
-    visits = [
-        SearchedAgain(scan.frame.image, fetch_location(scan.scan), missed, settings, project.max_pixels)
+    searches = [
+        RepeatedSearch(scan.frame.image, fetch_location(scan.scan), missed, settings, project.max_pixels)
         for scan in scans
-        if (missed := _missed(field, scan, adjustment, settings))
+        if (missed := _missed_targets(field, scan, adjustment, settings))
     ]
-    if not visits:
+    if not searches:
         return None
     found = dict[str, tuple[MarkMeasurement, ...] | str]()
     with executor() as workers, reporter.stage("second pass of scan") as count:
-        for done, (visit, result) in enumerate(iterate_results(looked_again, visits, workers), 1):
-            found[visit.image] = str(result) if isinstance(result, Exception) else result
-            count(visit.image, done, len(visits))
-    visited = [_visited(scan, found.get(scan.frame.image, ()), field, adjustment) for scan in scans]
-    return tuple(visited) if any(new is not old for new, old in zip(visited, scans, strict=True)) else None
+        for done, (search, result) in enumerate(iterate_results(search_again, searches, workers), 1):
+            found[search.image] = str(result) if isinstance(result, Exception) else result
+            count(search.image, done, len(searches))
+    changed = [_add_targets(scan, found.get(scan.frame.image, ()), field, adjustment) for scan in scans]
+    return tuple(changed) if any(new is not old for new, old in zip(changed, scans, strict=True)) else None
 
 
-def looked_again(visit: SearchedAgain) -> tuple[MarkMeasurement, ...] | str:
+def search_again(search: RepeatedSearch) -> tuple[MarkMeasurement, ...] | str:
     """Measure the predicted targets of a scan; return those found, or why the scan cannot be searched. Raises nothing
     but interrupts."""
     try:
-        with open_scan(scan_path(visit.scan), visit.max_pixels) as opened:
-            grey = opened if visit.settings.code is None else opened.green_channel()
-            marks = without_lost(opened, measure_single_targets(grey, visit.sought, visit.settings))
+        with open_scan(scan_path(search.scan), search.max_pixels) as opened:
+            grey = opened if search.settings.code is None else opened.green_channel()
+            marks = without_lost(opened, measure_single_targets(grey, search.sought, search.settings))
     except Exception as error:
         return " ".join(str(error).split()) or type(error).__name__
     return tuple(mark for mark in marks if mark.status.is_observation)
 
 
-def _missed(
+def _missed_targets(
     field: TargetField, scan: MeasuredScan, adjustment: Adjustment, settings: TargetSettings
 ) -> tuple[TargetPrediction, ...]:
     """Predictions of the targets that were missed in a scan; not of those that a person decided about."""
@@ -112,19 +112,19 @@ def _missed(
     )
 
 
-def _visited(
-    scan: MeasuredScan, seen: Sequence[MarkMeasurement] | str, field: TargetField, adjustment: Adjustment
+def _add_targets(
+    scan: MeasuredScan, found: Sequence[MarkMeasurement] | str, field: TargetField, adjustment: Adjustment
 ) -> MeasuredScan:
     """Scan with the targets found in the second pass; the same object if there are none."""
-    if isinstance(seen, str):
-        problem = Reason(f"The second pass failed: {seen}", Code.UNREACHABLE)
+    if isinstance(found, str):
+        problem = Reason(f"The second pass failed: {found}", Code.UNREACHABLE)
         return scan.changed(problems=[problem])
     targets = {mark.point: mark for mark in scan.frame.marks if mark.kind not in ON_FILM}
     taken = [mark.center_px for mark in targets.values() if mark.status.is_observation and mark.center_px is not None]
     taken_px = np.array(taken).reshape(-1, 2)  # places at which another target has been measured
     fresh = {
         mark.point: mark
-        for mark in seen
+        for mark in found
         if mark.center_px is not None and not (np.hypot(*(taken_px - mark.center_px).T) < _SEARCH_PX).any()
     }
     if not fresh:

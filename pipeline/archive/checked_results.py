@@ -22,7 +22,7 @@ import numpy as np
 from measure.flags import Code, Reason, Status
 from measure.results import FrameMeasurement
 from pipeline.archive import schema
-from pipeline.archive.results_database import Store
+from pipeline.archive.results_database import ResultsDatabase
 from pipeline.archive.verdicts import Verdict, scan_doubt, scan_verdict
 from pipeline.errors import InputError
 from pipeline.provenance import fingerprint, hash_file
@@ -40,12 +40,12 @@ from pipeline.text.files import FilePath
 
 _AT_A_TIME = 500  # frames per transaction
 _WRITTEN = "comparator.csv"
-_UNFINISHED = "digest like 'unfinished%'"  # its process was ended before the judging was complete
+_UNFINISHED = "digest like 'unfinished%'"  # its process was ended before the check run was complete
 
 
 @dataclass(frozen=True)
-class Judging:
-    """One run of the cross-scan checks, in an open store.
+class CheckRun:
+    """One run of the cross-scan checks, in an open results database.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class Judging:
     input : SHA-256 of the results that were checked.
     """
 
-    store: Store
+    database: ResultsDatabase
     row: int
     digest: str
     made_from: Mapping[str, str]
@@ -62,12 +62,12 @@ class Judging:
 
     def check(self) -> None:
         """Raise DamagedError where the list of frames is damaged."""
-        schema.check_judging(self.store.connection, self.row, self.store.path)
+        schema.verify_check_run(self.database.connection, self.row, self.database.path)
 
     def values(self, columns: str) -> list[tuple[Any, ...]]:
         """Columns of checked_frame, for all frames."""
         query = f"select {columns} from checked_frame where judging = ?"
-        return self.store.connection.execute(query, (self.row,)).fetchall()
+        return self.database.connection.execute(query, (self.row,)).fetchall()
 
     @cached_property
     def names(self) -> frozenset[str]:
@@ -98,7 +98,7 @@ class Judging:
 
     def written_scans(self) -> Iterator[MeasuredScan]:
         """Scans on which writing was found."""
-        written = self.store.written()
+        written = self.database.results_with_writing()
         return self.scans({name for name, result in self.values("name, result") if result in written})
 
     def scans(self, images: Collection[str] | None = None) -> Iterator[MeasuredScan]:
@@ -106,7 +106,7 @@ class Judging:
 
         images: only these; None for all. Raises DamagedError where the list of frames is damaged.
         """
-        folder = self.store.project_folder
+        folder = self.database.project_folder
         for name, (uri, measured, changed), rows in self._frames("uri, measured, changed", images):
             try:
                 if rows is None:
@@ -114,7 +114,7 @@ class Judging:
                 detail = json.loads(measured) | json.loads(changed or "{}")
                 yield read_scan(name, detail, rows, scan_location(uri, folder))
             except (ValueError, TypeError, KeyError):
-                sentence = str(schema.damaged_result(name, self.store.path))
+                sentence = str(schema.damaged_result(name, self.database.path))
                 frame = FrameMeasurement(name, (), problems=(Reason(sentence, Code.FAILED_SCAN),))
                 yield MeasuredScan.failed("", frame, Failure(FailureCode.DAMAGED, sentence))
 
@@ -125,7 +125,7 @@ class Judging:
         """
         for name, (across_um, down_um), rows in self._frames("pitch_x_um, pitch_y_um", images):
             if rows is None:
-                raise schema.damaged_result(name, self.store.path)
+                raise schema.damaged_result(name, self.database.path)
             for point, kind, col, row, *spread, causes, status, _, reason, _ in rows:
                 xy_mm = sigma_mm = None
                 rho = 0.0
@@ -143,7 +143,7 @@ class Judging:
         if images is None:
             self.check()
         names = self.names if images is None else self.names.intersection(images)
-        connection, own = self.store.connection, "where judging = ? and scan = ?"
+        connection, own = self.database.connection, "where judging = ? and scan = ?"
         frames = connection.execute("select name, scan from judged_frame where judging = ? order by name", (self.row,))
         for name, scan in [frame for frame in frames if frame[0] in names]:
             query = f"select is_whole, {columns} from checked_frame {own}"
@@ -157,34 +157,34 @@ class Judging:
     def plain(self) -> tuple[tuple[str, str, int], ...]:
         """Image, scan's file and row of the result of the frames that are reported only in totals: good ones in which,
         of their targets, tie points and joins, at least one each is observed."""
-        rows = self.store.connection.execute(_PLAIN, (self.row, str(Verdict.GOOD)))
+        rows = self.database.connection.execute(_PLAIN, (self.row, str(Verdict.GOOD)))
         return tuple((name, uri, result) for name, uri, result in rows)
 
     def plain_marks(self) -> Iterator[tuple[int, str, str, float | None, float | None]]:
         """Row of the result, kind, status, column and row of each mark of the plain frames."""
         plain = {result for _, _, result in self.plain}
         query = "select result, kind, status, col_px, row_px from checked_mark where judging = ? and verdict = ?"
-        marks = self.store.connection.execute(query, (self.row, str(Verdict.GOOD)))
+        marks = self.database.connection.execute(query, (self.row, str(Verdict.GOOD)))
         return (mark for mark in marks if mark[0] in plain)
 
     def remember_written(self, comparator: Path) -> None:
         """Record that the file now holds the marks."""
-        self.store.remember(_WRITTEN, self._written(comparator))
+        self.database.remember(_WRITTEN, self._file_state(comparator))
 
     def is_written(self, comparator: Path) -> bool:
         """Whether the file holds the marks and has not been changed since."""
-        return self.store.recall(_WRITTEN) == self._written(comparator)
+        return self.database.recall(_WRITTEN) == self._file_state(comparator)
 
-    def _written(self, comparator: Path) -> dict[str, str]:
+    def _file_state(self, comparator: Path) -> dict[str, str]:
         return {"digest": self.digest, "file": hash_file(comparator) if comparator.exists() else ""}
 
     def drop_others(self) -> None:
-        """Delete all other judgings."""
-        with self.store.writing():
-            self.store.connection.execute("delete from judging where digest <> ?", (self.digest,))
+        """Delete all other check runs."""
+        with self.database.writing():
+            self.database.connection.execute("delete from judging where digest <> ?", (self.digest,))
 
-    def rejudge(self, scans: Sequence[MeasuredScan], settings: object) -> "Judging":
-        """Store a judging of the same results after a second pass, which a later `measure` keeps. settings: of the
+    def store_second_pass(self, scans: Sequence[MeasuredScan], settings: object) -> "CheckRun":
+        """Store a check run of the same results after a second pass, which a later `measure` keeps. settings: of the
         adjustment."""
         self.check()
         rows = {name: known for name, *known in self.values("name, result, decisions")}
@@ -194,11 +194,11 @@ class Judging:
             for result, decisions in [rows[scan.frame.image]]
         )
         _, _, first = self.input.rpartition(" ")
-        return judge(self.store, self.made_from, second_pass_input(first, settings), frames)
+        return store_checks(self.database, self.made_from, second_pass_input(first, settings), frames)
 
 
 def second_pass_input(input_hash: str, settings: object) -> str:
-    """Input of a judging after a second pass. input_hash: before it."""
+    """Input of a check run after a second pass. input_hash: before it."""
     return f"second pass {fingerprint(settings)} {input_hash}"
 
 
@@ -246,40 +246,44 @@ class Lot:
     frames: Callable[[], Iterable[CheckedResult]]
 
 
-def judge(store: Store, made_from: Mapping[str, str], input_hash: str, frames: Iterable[CheckedResult]) -> Judging:
-    """Store a judging of a single lot, without reuse of earlier judgings; see `judge_lots`."""
-    return judge_lots(store, made_from, input_hash, [Lot("", lambda: frames)])
+def store_checks(
+    database: ResultsDatabase, made_from: Mapping[str, str], input_hash: str, frames: Iterable[CheckedResult]
+) -> CheckRun:
+    """Store a check run of a single lot, without reuse of earlier check runs; see `store_lots`."""
+    return store_lots(database, made_from, input_hash, [Lot("", lambda: frames)])
 
 
-def judge_lots(store: Store, made_from: Mapping[str, str], input_hash: str, lots: Iterable[Lot]) -> Judging:
-    """Store a judging of all frames, completely or not at all, and return it.
+def store_lots(
+    database: ResultsDatabase, made_from: Mapping[str, str], input_hash: str, lots: Iterable[Lot]
+) -> CheckRun:
+    """Store a check run of all frames, completely or not at all, and return it.
 
-    A lot whose input is unchanged is copied from an earlier judging. Of each frame only differences from the raw result
-    are stored.
+    A lot whose input is unchanged is copied from an earlier check run. Of each frame only differences from the raw
+    result are stored.
     """
     made = dict(made_from)
     hasher = hashlib.sha256(json.dumps([made, input_hash], sort_keys=True).encode())
     begun = {"digest": f"unfinished {input_hash}", "made_from": json.dumps(made), "input": input_hash}
-    with store.writing():
-        store.connection.execute(f"delete from judging where {_UNFINISHED}")
-        row = store.insert("judging", begun)
+    with database.writing():
+        database.connection.execute(f"delete from judging where {_UNFINISHED}")
+        row = database.insert("judging", begun)
     for number, lot in enumerate(lots):
-        output = _copy_lot(store, row, number, lot) or _write_lot(store, row, number, lot.frames())
+        output = _copy_lot(database, row, number, lot) or _write_lot(database, row, number, lot.frames())
         hasher.update(output.encode())
-        with store.writing():
-            store.insert("judged_lot", {"judging": row, "lot": number, "input": lot.input, "output": output})
+        with database.writing():
+            database.insert("judged_lot", {"judging": row, "lot": number, "input": lot.input, "output": output})
     digest = hasher.hexdigest()
-    with store.writing():
-        store.connection.execute("delete from judging where digest = ?", (digest,))
+    with database.writing():
+        database.connection.execute("delete from judging where digest = ?", (digest,))
         update = f"update judging set digest = ?, frames_digest = {schema.FRAMES_DIGEST} where id = ?"
-        store.connection.execute(update, (digest, row))
-    return Judging(store, row, digest, made, input_hash)
+        database.connection.execute(update, (digest, row))
+    return CheckRun(database, row, digest, made, input_hash)
 
 
-def _copy_lot(store: Store, judging: int, number: int, lot: Lot) -> str:
-    """Copy a sound lot from a judging with the same input and return the hash of its content; "" if there is none."""
+def _copy_lot(database: ResultsDatabase, check_run: int, number: int, lot: Lot) -> str:
+    """Copy a sound lot from a check run with the same input and return the hash of its content; "" if there is none."""
     own = "from judged_frame where judging = ? and lot = ?"
-    found = store.connection.execute(
+    found = database.connection.execute(
         "select judging, lot, output from judged_lot join judging on judging.id = judging "
         f"where judged_lot.input = ? and not {_UNFINISHED} order by judging desc limit 1",
         (lot.input,),
@@ -290,119 +294,119 @@ def _copy_lot(store: Store, judging: int, number: int, lot: Lot) -> str:
     is_whole = (
         f"{schema.is_sound('judged_frame')} and (not own_marks or marks_digest is {schema.checked_marks_digest()})"
     )
-    if store.first(f"select exists (select 1 {own} and not ({is_whole}))", before, old):
+    if database.first(f"select exists (select 1 {own} and not ({is_whole}))", before, old):
         return ""
     frame = "scan, result, name, verdict, why, own_marks, detail, decisions, marks_digest"
-    with store.writing():
-        store.connection.execute(
+    with database.writing():
+        database.connection.execute(
             f"insert into judged_frame (judging, lot, {frame}) select ?, ?, {frame} {own}",
-            (judging, number, before, old),
+            (check_run, number, before, old),
         )
-        store.connection.execute(
+        database.connection.execute(
             f"insert into judged (judging, result, {schema.MARKS}) select ?, result, {schema.MARKS} "
             f"from judged where judging = ? and result in (select result {own} and own_marks)",
-            (judging, before, before, old),
+            (check_run, before, before, old),
         )
     return str(output)
 
 
-def _write_lot(store: Store, judging: int, number: int, frames: Iterable[CheckedResult]) -> str:
+def _write_lot(database: ResultsDatabase, check_run: int, number: int, frames: Iterable[CheckedResult]) -> str:
     """Check the frames of a lot, store them, and return the hash of the content."""
     hasher, left = hashlib.sha256(), iter(frames)
     while some := list(islice(left, _AT_A_TIME)):  # no open transaction here: the checks may measure and store scans
-        with store.writing():
+        with database.writing():
             for frame in some:
-                hasher.update(_write_frame(store, judging, number, frame))
+                hasher.update(_write_frame(database, check_run, number, frame))
     return hasher.hexdigest()
 
 
-def _write_frame(store: Store, judging: int, lot: int, frame: CheckedResult) -> bytes:
+def _write_frame(database: ResultsDatabase, check_run: int, lot: int, frame: CheckedResult) -> bytes:
     """Store the differences of a checked frame from its raw result, and return the stored content for hashing."""
-    measured = json.loads(store.detail(frame.result))
+    measured = json.loads(database.detail(frame.result))
     now = scan_detail(frame.scan, measured["scan"])
     changed = {key: value for key, value in now.items() if value != measured.get(key)}
     detail = json.dumps(changed, ensure_ascii=False) if changed else None
     rows = [mark_row(mark) for mark in frame.scan.frame.marks]
-    own_marks = rows != store.mark_rows(frame.result)
+    own_marks = rows != database.mark_rows(frame.result)
     rows = rows if own_marks else []
-    scan, key = store.connection.execute(
+    scan, key = database.connection.execute(
         "select scan, fingerprint from result where id = ?", (frame.result,)
     ).fetchone()
-    keys = {"judging": judging, "result": frame.result}
+    keys = {"judging": check_run, "result": frame.result}
     checked = {"lot": lot, "scan": scan, "name": frame.scan.frame.image, "decisions": frame.decisions}
     checked |= {"verdict": str(scan_verdict(frame.scan)), "why": scan_doubt(frame.scan)}
-    store.insert("judged_frame", keys | checked | {"own_marks": own_marks, "detail": detail})
-    store.insert_marks("judged", keys, rows)
-    store.connection.execute(
+    database.insert("judged_frame", keys | checked | {"own_marks": own_marks, "detail": detail})
+    database.insert_marks("judged", keys, rows)
+    database.connection.execute(
         f"update judged_frame set marks_digest = {schema.checked_marks_digest()} where judging = ? and scan = ?",
-        (judging, scan),
+        (check_run, scan),
     )
     return json.dumps([frame.scan.frame.image, key, detail, rows]).encode()
 
 
-def find_judging(store: Store, digest: str) -> Judging | None:
-    """Judging with that digest, None if there is none. Raises DamagedError where its row is damaged."""
+def find_check_run(database: ResultsDatabase, digest: str) -> CheckRun | None:
+    """Check run with that digest, None if there is none. Raises DamagedError where its row is damaged."""
     query = f"select {schema.is_sound('judging')}, id, digest, made_from, input from judging where digest = ?"
-    found = store.connection.execute(query, (digest,)).fetchone()
+    found = database.connection.execute(query, (digest,)).fetchone()
     if found is None:
         return None
     is_whole, row, digest, made_from, input_hash = found
     if not is_whole:
-        raise schema.damaged_judging(store.path)
-    return Judging(store, row, digest, json.loads(made_from), input_hash)
+        raise schema.damaged_check_run(database.path)
+    return CheckRun(database, row, digest, json.loads(made_from), input_hash)
 
 
-def latest(store: Store) -> Judging | None:
-    """Latest judging, None if there is none. Raises DamagedError where one is missing or damaged."""
-    is_lost = store.first(
+def latest(database: ResultsDatabase) -> CheckRun | None:
+    """Latest check run, None if there is none. Raises DamagedError where one is missing or damaged."""
+    is_lost = database.first(
         f"select exists (select 1 from judging where seal is not null and not {schema.is_sound('judging')}) or "
         "exists (select 1 from judged_frame where judging not in (select id from judging))"
     )
-    digest = store.first(f"select digest from judging where not {_UNFINISHED} order by id desc limit 1")
-    judging = None if is_lost or digest is None else find_judging(store, digest)
-    if is_lost or (judging is None and digest is not None):  # the index of digests used for the lookup lacks the row
-        raise schema.damaged_judging(store.path)
-    return judging
+    digest = database.first(f"select digest from judging where not {_UNFINISHED} order by id desc limit 1")
+    check_run = None if is_lost or digest is None else find_check_run(database, digest)
+    if is_lost or (check_run is None and digest is not None):  # the index of digests used for the lookup lacks the row
+        raise schema.damaged_check_run(database.path)
+    return check_run
 
 
 @contextmanager
-def stored_judging(path: Path, digest: str) -> Iterator[Judging | None]:
-    """Judging with that digest in a store; None where there is no such store or judging."""
+def stored_check_run(path: Path, digest: str) -> Iterator[CheckRun | None]:
+    """Check run with that digest in a database; None where there is no such database or check run."""
     if not digest or not path.exists():
         yield None
         return
-    with Store(path) as store:
-        yield find_judging(store, digest)
+    with ResultsDatabase(path) as database:
+        yield find_check_run(database, digest)
 
 
 @contextmanager
-def written_judging(path: Path, comparator: Path) -> Iterator[Judging | None]:
-    """Judging of a store from which comparator.csv was written; None where the file holds other marks, or either was
-    changed since."""
-    with stored_judging(path, read_measurement_hash(comparator) if comparator.exists() else "") as judging:
-        if judging is None or not judging.is_written(comparator):
+def written_check_run(path: Path, comparator: Path) -> Iterator[CheckRun | None]:
+    """Check run from which comparator.csv was written; None where the file holds other marks, or either was changed
+    since."""
+    with stored_check_run(path, read_measurement_hash(comparator) if comparator.exists() else "") as check_run:
+        if check_run is None or not check_run.is_written(comparator):
             yield None
             return
-        judging.check()
-        yield None if schema.damaged_frames(judging.store.connection, judging.row) else judging
+        check_run.check()
+        yield None if schema.damaged_frames(check_run.database.connection, check_run.row) else check_run
 
 
 def read_measurement(path: FilePath, digest: str = "") -> tuple[MeasuredScan, ...]:
-    """Scans of a store after the cross-scan checks, sorted by name. digest: of the judging; "" for the latest.
+    """Scans of a database after the cross-scan checks, sorted by name. digest: of the check run; "" for the latest.
 
-    Raises InputError where there is no such store, or no judging in it.
+    Raises InputError where there is no such database, or no check run in it.
     """
     return tuple(measured_scans(Path(path), digest))
 
 
 def measured_scans(path: Path, digest: str = "", images: Collection[str] | None = None) -> Iterator[MeasuredScan]:
-    """Yield the scans of a store one by one; see `read_measurement`. images: only these; None for all."""
+    """Yield the scans of a database one by one; see `read_measurement`. images: only these; None for all."""
     if not path.exists():
         raise InputError(f"{path}: there is no such file. Run `reseau measure` first.")
-    with Store(path) as store:
-        judging = find_judging(store, digest) if digest else latest(store)
-        if judging is None:
+    with ResultsDatabase(path) as database:
+        check_run = find_check_run(database, digest) if digest else latest(database)
+        if check_run is None:
             raise InputError(
                 f"{path}: its scans have not passed the cross-scan checks. Run `reseau measure`, which continues."
             )
-        yield from judging.scans(images)
+        yield from check_run.scans(images)

@@ -9,7 +9,7 @@ from measure.flags import Code, Reason, Status
 from measure.results import MEASURE_REVISION
 from measure.scans.remote import scan_path
 from pipeline.archive.checked_results import Lot
-from pipeline.archive.results_database import Store
+from pipeline.archive.results_database import ResultsDatabase
 from pipeline.archive.work import Work
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
@@ -72,12 +72,12 @@ def check_lots(
         )
 
 
-def find_copies(store: Store, tasks: Sequence[ScanTask], work: Work) -> dict[str, str]:
+def find_copies(database: ResultsDatabase, tasks: Sequence[ScanTask], work: Work) -> dict[str, str]:
     """Return {image: first image, by name, with the same file content}.
 
     Whole files are read only where size and the hash of parts agree.
     """
-    identities, hashes = store.identities(), store.content_hashes()
+    identities, hashes = database.identities(), database.content_hashes()
 
     def parts(task: ScanTask) -> object:
         known = identities.get(work.state(task).uri)
@@ -91,8 +91,8 @@ def find_copies(store: Store, tasks: Sequence[ScanTask], work: Work) -> dict[str
     copies = dict[str, str]()
     for original, *others in alike_groups(sorted(tasks, key=lambda task: task.name), parts, content):
         copies |= {task.name: original.name for task in others}
-    store.set_content_hashes(hashes)
-    store.set_copies({work.state(task).uri: copies[task.name] for task in tasks if task.name in copies})
+    database.set_content_hashes(hashes)
+    database.set_copies({work.state(task).uri: copies[task.name] for task in tasks if task.name in copies})
     return copies
 
 
@@ -145,7 +145,7 @@ def _check_camera(
 
 def _writing_remarks(project: Project, tasks: Sequence[ScanTask], work: Work) -> Remarks:
     """Remarks from the writing about other scans: plates of other cameras, frames scanned twice."""
-    names = work.written([task.name for task in tasks])
+    names = work.names_with_writing([task.name for task in tasks])
     bare = dict[str, MeasuredScan]()
     for camera in project.cameras.values():
         own = [work.read_writing(name) for name in names if project.image_camera(name) is camera]
@@ -158,4 +158,4 @@ def _copy(scan: MeasuredScan, original: str) -> MeasuredScan:
     """Scan with all observations rejected, since they count in the scan of which its file is a copy."""
     reason = Reason(f"its file is a copy of that of {original}, which counts", Code.COPY)
     sentence = f"its file is byte for byte that of {original}: its marks count once. Name one of both in `exclude`."
-    return scan.restated(None, Status.REJECTED, reason).changed(problems=[Reason(sentence, Code.COPY)])
+    return scan.with_status(None, Status.REJECTED, reason).changed(problems=[Reason(sentence, Code.COPY)])

@@ -5,7 +5,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from pipeline.archive.results_database import Store
+from pipeline.archive.results_database import ResultsDatabase
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.provenance import FileIdentity, FileStates, fingerprint, hash_text, parts_hash
@@ -39,8 +39,8 @@ def measured_from(project: Project) -> MadeFrom:
     The latter do not change a measured mark, but determine which ones are found and how they are named."""
     known, files = dict[str, FileIdentity](), FileStates(project.path.resolve().parent)
     if project.measurement_path.exists():
-        with Store(project.measurement_path) as store:
-            known = store.identities()
+        with ResultsDatabase(project.measurement_path) as database:
+            known = database.identities()
     coordinates = {id: [prior and prior.value for prior in (p.X, p.Y, p.Z)] for id, p in project.object_points.items()}
     places = [
         coordinates,
@@ -106,7 +106,7 @@ def adjusted_from(project: Project, marks: Sequence[ComparatorPoint]) -> MadeFro
 
 
 def _parts(path: Path, known: Mapping[str, FileIdentity], files: FileStates) -> tuple[int, str]:
-    """Size of a scan's file and hash of its parts, read only where its state differs from that in the store."""
+    """Size of a scan's file and hash of its parts, read only where its state differs from that in the database."""
     state = files.get(path)
     found = known.get(state.uri)
     is_known = found is not None and found.state == state

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from measure.errors import MeasurementError
 from measure.scans.remote import fetch_location, scan_path
-from pipeline.archive.checked_results import Judging, judge_lots, latest, second_pass_input
+from pipeline.archive.checked_results import CheckRun, latest, second_pass_input, store_lots
 from pipeline.archive.cross_scan_checks import check_lots, find_copies, hash_inputs
 from pipeline.archive.made_from import measured_from
-from pipeline.archive.results_database import Store
+from pipeline.archive.results_database import ResultsDatabase
 from pipeline.archive.review_decisions import tell_inapplicable
-from pipeline.archive.thumbnails import ThumbnailStore
+from pipeline.archive.thumbnails import ThumbnailDatabase
 from pipeline.archive.work import Work
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
@@ -51,29 +51,29 @@ def check_measurable(project: Project) -> tuple[str, ...]:
     return names
 
 
-def find_touched(store: Store, project: Project) -> dict[str, str]:
+def find_touched(database: ResultsDatabase, project: Project) -> dict[str, str]:
     """Re-key the results of files of another time with the content that was measured; return {old fingerprint: new}."""
-    known, hashes = store.identities(), store.content_hashes()
+    known, hashes = database.identities(), database.content_hashes()
     files, keys = FileStates(project.path.resolve().parent), dict[str, str]()
     reviewed = {one.image for one in project.decisions}
     for name, file in as_named(project.scans).items():
         state = files.get(file)
         earlier, content = known.get(state.uri), hashes.get(state.uri)
         if earlier and content and state.is_touched(earlier.state) and content_hash(Path(file)) == content:
-            keys |= store.move(state.uri, FileIdentity(state, earlier.parts_hash), name in reviewed)
+            keys |= database.move(state.uri, FileIdentity(state, earlier.parts_hash), name in reviewed)
     return keys
 
 
-def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, str]:
+def find_moved(database: ResultsDatabase, project: Project, reporter: Reporter) -> dict[str, str]:
     """Re-key the results of moved files by content hash and return {old fingerprint: new}.
 
     Only results whose content was hashed by an earlier call with `--moved` are found.
     """
-    known, files = store.identities(), FileStates(project.path.resolve().parent)
+    known, files = database.identities(), FileStates(project.path.resolve().parent)
     states = {name: files.get(file) for name, file in as_named(project.scans).items()}
     unknown = {name: state for name, state in states.items() if state != getattr(known.get(state.uri), "state", None)}
     taken = {state.uri for name, state in states.items() if name not in unknown}
-    free = {content: uri for uri, content in store.content_hashes().items() if uri not in taken}
+    free = {content: uri for uri, content in database.content_hashes().items() if uri not in taken}
     sizes = {known[uri].state.bytes for uri in free.values()}
     reviewed = {one.image for one in project.decisions}
     found, keys = 0, dict[str, str]()
@@ -83,7 +83,7 @@ def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, 
             path = project.scans[name]
             uri = free.pop(content_hash(path), "") if state.bytes in sizes else ""
             if uri and uri not in taken:  # nor has another file come to its place
-                keys |= store.move(uri, FileIdentity(state, parts_hash(path)), name in reviewed)
+                keys |= database.move(uri, FileIdentity(state, parts_hash(path)), name in reviewed)
                 taken.add(state.uri)
                 found += 1
     if unknown:
@@ -91,29 +91,31 @@ def find_moved(store: Store, project: Project, reporter: Reporter) -> dict[str, 
     return keys
 
 
-def hash_contents(store: Store, folder: Path, tasks: Sequence[ScanTask], work: Work, everywhere: bool) -> None:
+def hash_contents(
+    database: ResultsDatabase, folder: Path, tasks: Sequence[ScanTask], work: Work, everywhere: bool
+) -> None:
     """Hash the whole files of scans without a content hash, so that they are recognised when touched.
 
     everywhere: those of any size, so that they are recognised after a move, too. folder: that of the project.
     """
-    hashed, files, left = store.content_hashes(), FileStates(folder), dict[str, Path]()
+    hashed, files, left = database.content_hashes(), FileStates(folder), dict[str, Path]()
     for task in (task for task in tasks if task.scan):
         state, path = work.state(task), scan_path(task.scan)
         is_wanted = state.uri not in hashed and (everywhere or state.is_cheap)
         if is_wanted and files.get(path) == state:  # else it was changed since it was measured
             left[state.uri] = path
     for uri, path in left.items():
-        store.set_content_hashes({uri: content_hash(path)})
+        database.set_content_hashes({uri: content_hash(path)})
 
 
 def measure_archive(
-    project: Project, store: Store, learned_folder: Path, reporter: Reporter, options: WorkOptions
-) -> Judging | None:
+    project: Project, database: ResultsDatabase, learned_folder: Path, reporter: Reporter, options: WorkOptions
+) -> CheckRun | None:
     """Measure the missing scans of a project and check all of them together, unless nothing has changed.
 
     Returns
     -------
-    The judging; None for a shard, which has no cross-scan checks.
+    The check run; None for a shard, which has no cross-scan checks.
 
     Raises
     ------
@@ -123,40 +125,40 @@ def measure_archive(
         No scan could be measured; single failures are results.
     """
     names = check_measurable(project)
-    store.set_project_folder(project.path.parent)
-    with open_executor(project, options) as executor, ThumbnailStore(store.path) as thumbnails:
+    database.set_project_folder(project.path.parent)
+    with open_executor(project, options) as executor, ThumbnailDatabase(database.path) as thumbnails:
         # After all checks that could prevent a new measurement.
-        lost = store.forget_damaged() if options.retry or store.has_damaged_rows() else 0
+        lost = database.forget_damaged() if options.retry or database.has_damaged_rows() else 0
         if lost:
-            reporter.say(f"{store.path}: {counted(lost, 'result')} damaged (digest differs): measured again")
+            reporter.say(f"{database.path}: {counted(lost, 'result')} damaged (digest differs): measured again")
         if options.retry:
-            store.forget_failed()
-        thumbnails.rekey(find_touched(store, project))
+            database.forget_failed()
+        thumbnails.rekey(find_touched(database, project))
         if options.moved:
-            thumbnails.rekey(find_moved(store, project, reporter))
-        work = Work(project, store, executor, options, thumbnails)
-        learned = learn_marks(project, reporter, work.measure, executor, learned_folder, store)
-        tasks = scan_tasks(learned, names, collect_tones(learned, reporter, work.measure, store))
+            thumbnails.rekey(find_moved(database, project, reporter))
+        work = Work(project, database, executor, options, thumbnails)
+        learned = learn_marks(project, reporter, work.measure, executor, learned_folder, database)
+        tasks = scan_tasks(learned, names, collect_tones(learned, reporter, work.measure, database))
         tasks, _ = add_known_lines(tasks, work.measure, reporter)
-        store.set_project({work.state(task).uri: task.name for task in tasks})
+        database.set_project({work.state(task).uri: task.name for task in tasks})
         if options.shard is not None:
             part, parts = options.shard
             work.complete([task for task in tasks if shard_number(task.name, parts) == part], reporter)
             return None
         work.complete(tasks, reporter)
-        hash_contents(store, project.path.resolve().parent, tasks, work, options.moved)
-        if (failures := store.failures()) is not None:
+        hash_contents(database, project.path.resolve().parent, tasks, work, options.moved)
+        if (failures := database.failures()) is not None:
             raise MeasurementError("\n".join(gathered(failures)))
-        copies = find_copies(store, tasks, work)
+        copies = find_copies(database, tasks, work)
         made = measured_from(project)
         input_hash = hash_inputs(tasks, work, copies, made)
-        judging = latest(store)
-        if judging is None or judging.input not in (input_hash, second_pass_input(input_hash, project.adjust)):
+        check_run = latest(database)
+        if check_run is None or check_run.input not in (input_hash, second_pass_input(input_hash, project.adjust)):
             share = partial(tie_scans, learned, reporter=reporter, executor=executor)
             lots = check_lots(learned, tasks, work, copies, share, input_hash)
-            judging = judge_lots(store, made, input_hash, lots)
-        tell_inapplicable(learned, judging, work.decisions, work.counting)
-        return judging
+            check_run = store_lots(database, made, input_hash, lots)
+        tell_inapplicable(learned, check_run, work.decisions, work.counting)
+        return check_run
 
 
 def open_executor(project: Project, options: WorkOptions) -> AbstractContextManager[Executor]:

@@ -63,7 +63,7 @@ class Kept:
         return result_key(self.identity, hash_text(self.options_json))
 
 
-class Store(Database):
+class ResultsDatabase(Database):
     """Open results database of a project; closed at the end of the `with` block."""
 
     # --- scans
@@ -125,12 +125,12 @@ class Store(Database):
             detail = json.loads(self.detail(result))
             return read_scan(image, detail, rows, scan_location(detail["scan"], folder))
         except (ValueError, TypeError, KeyError):  # damaged before its rows had digests
-            raise self._damaged(result) from None
+            raise self._damage_error(result) from None
 
     def mark_rows(self, result: int) -> list[tuple[Any, ...]]:
         """Rows of the marks of a result. Raises DamagedError where they are damaged."""
         if not self.first(f"select {is_result_sound()} from result where id = ?", result):
-            raise self._damaged(result)
+            raise self._damage_error(result)
         rows = self.connection.execute(f"select {MARKS} from mark where result = ? order by number", (result,))
         return [tuple(row) for _, *row in rows]
 
@@ -138,16 +138,16 @@ class Store(Database):
         """JSON of the remaining content of a result. Raises DamagedError where it is damaged."""
         found = self.first(f"select detail from result where id = ? and {is_sound('result')}", result)
         if found is None:
-            raise self._damaged(result)
+            raise self._damage_error(result)
         return str(found)
 
-    def _damaged(self, result: int) -> DamagedError:
+    def _damage_error(self, result: int) -> DamagedError:
         own = "result = ?1 or id = (select scan from result where id = ?1)"
         image = self.first(f"select coalesce(name, uri) from scan where {own}", result)
         return damaged_result(image or "(unknown)", self.path)
 
     def has_damaged_rows(self) -> bool:
-        """Whether a row of a scan, result, judging or value kept for other scans is damaged; marks are not checked."""
+        """Whether a row of a scan, result or check run, or a kept value, is damaged; marks are not checked."""
         tables = {"scan": "", "result": "", "kept": "", "judging": "and digest not like 'unfinished%'"}
         query = "select exists (select 1 from {0} not indexed where not {1} {2})"
         return any(self.first(query.format(table, is_sound(table), end)) for table, end in tables.items())
@@ -166,11 +166,11 @@ class Store(Database):
             return self._forget(self.column("select id from result where verdict = ?", str(Verdict.FAILED)))
 
     def _forget(self, results: Collection[int], scans: Collection[int] = ()) -> int:
-        """Delete results, scans with all of theirs, and all judgings; return the number of results."""
+        """Delete results, scans with all of theirs, and all check runs; return the number of results."""
         listed, own = "in (select value from json_each(?))", json.dumps(list(scans))
         lost = {*results, *self.column(f"select id from result where scan {listed}", own)}
         rows, delete = json.dumps(list(lost)), self.connection.execute
-        for table in ("judged", "judged_frame", "judged_lot", "judging"):  # including those of a missing judging
+        for table in ("judged", "judged_frame", "judged_lot", "judging"):  # including those of a missing check run
             delete(f"delete from {table}")
         delete(f"delete from mark where result {listed}", (rows,))
         delete(f"update scan set result = null, is_current = 0 where result {listed}", (rows,))
@@ -179,7 +179,7 @@ class Store(Database):
         delete(f"delete from scan where id {listed}", (own,))
         return len(lost)
 
-    def written(self) -> set[int]:
+    def results_with_writing(self) -> set[int]:
         """Rows of results of scans on which writing was found."""
         return {*self.column("select id from result where coalesce(detail ->> '$.writing', '[]') <> '[]'")}
 
@@ -270,7 +270,7 @@ class Store(Database):
         return self.path.parent / str((self.recall(_PLACE) or {"path": ".."})["path"])
 
     def set_project_folder(self, folder: Path) -> None:
-        """Store the project's folder relative to the store, so that a project can be moved as a whole."""
+        """Store the project's folder relative to the database, so that a project can be moved as a whole."""
         relative = os.path.relpath(folder.resolve(), self.path.resolve().parent)
         if self.recall(_PLACE) != {"path": relative}:
             self.remember(_PLACE, {"path": relative})
@@ -339,7 +339,7 @@ class Store(Database):
 
 
 class Merged(NamedTuple):
-    """Outcome of merging one store: number of its results, of those new here, and of damaged ones, which were not
+    """Outcome of merging one database: number of its results, of those new here, and of damaged ones, which were not
     taken."""
 
     path: Path
@@ -349,7 +349,7 @@ class Merged(NamedTuple):
 
 
 def check_mergeable(path: Path, others: Sequence[Path]) -> None:
-    """Raise InputError for a file that is no store, or the store at `path` itself, before anything is written."""
+    """Raise InputError for a file that is no database, or the store at `path` itself, before anything is written."""
     for other in others:
         head = b""
         if other.is_file():
@@ -360,31 +360,31 @@ def check_mergeable(path: Path, others: Sequence[Path]) -> None:
             raise InputError(f"{other}: {what} results database. Name the out/measurement.K-of-N.db of each part.")
         if other.resolve() == path.resolve():
             raise InputError(f"{other}: is the results database that the others are joined into. Name the others only.")
-        Store(other).close()
+        ResultsDatabase(other).close()
 
 
-def merge(store: Store, others: Sequence[Path]) -> list[Merged]:
-    """Import the results that other stores hold and this one lacks, after `check_mergeable`.
+def merge(database: ResultsDatabase, others: Sequence[Path]) -> list[Merged]:
+    """Import the results that other databases hold and this one lacks, after `check_mergeable`.
 
-    Each store is imported completely or not at all. The others are not changed, except for migration to this version.
+    Each is imported completely or not at all. The others are not changed, except for migration to this version.
     """
     merged = []
     for path in others:
-        store.connection.execute("attach ? as other", (str(path),))
+        database.connection.execute("attach ? as other", (str(path),))
         try:
-            results = int(store.first("select count(*) from other.result"))
-            sound = store.first(f"select total({is_result_sound('r', 'other.mark')}) from other.result r")
-            with store.writing():
-                merged.append(Merged(path, results, _insert(store), results - int(sound)))
+            results = int(database.first("select count(*) from other.result"))
+            sound = database.first(f"select total({is_result_sound('r', 'other.mark')}) from other.result r")
+            with database.writing():
+                merged.append(Merged(path, results, _insert(database), results - int(sound)))
         finally:
-            store.connection.execute("detach other")
+            database.connection.execute("detach other")
     return merged
 
 
-def _insert(store: Store) -> int:
+def _insert(database: ResultsDatabase) -> int:
     """Insert the rows of all tables in the order of their references; existing rows stay."""
-    insert = store.connection.execute
-    before = store.first("select coalesce(max(id), 0) from main.result")
+    insert = database.connection.execute
+    before = database.first("select coalesce(max(id), 0) from main.result")
     columns = ", ".join(COLUMNS["scan"][2:14])  # of the file and its content
     insert(
         f"insert into main.scan ({columns}, name) select {columns}, null from other.scan where {is_sound('scan')} "

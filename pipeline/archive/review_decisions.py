@@ -11,7 +11,7 @@ import numpy as np
 from measure.fiducials.options import CLICK_SIGMA_PX, Click
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import MEASURE_REVISION, Covariance, MarkMeasurement
-from pipeline.archive.checked_results import Judging
+from pipeline.archive.checked_results import CheckRun
 from pipeline.archive.schema import row_digest
 from pipeline.files.decisions_file import LEARNED, About, Decision, DecisionKind, push_decision, standing
 from pipeline.files.project_file import Project
@@ -108,7 +108,9 @@ def apply_decisions(
 def before_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:
     """The scan with all decisions except acceptance, so that rejected and absent marks do not affect the checks of
     other scans."""
-    return _changed(scan, {about: one for about, one in counting.items() if one.decision is not DecisionKind.ACCEPT})
+    return _apply_decisions(
+        scan, {about: one for about, one in counting.items() if one.decision is not DecisionKind.ACCEPT}
+    )
 
 
 def after_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:
@@ -116,22 +118,22 @@ def after_checks(scan: MeasuredScan, counting: Mapping[About, Decision]) -> Meas
     marks = {(scan.frame.image, mark.point, mark.kind) for mark in scan.frame.marks}
     applied = [one for about, one in counting.items() if not about[1] or about in marks]
     people = Counter(one.who or "somebody" for one in applied)
-    return replace(_changed(scan, counting), reviewers=dict(sorted(people.items())))
+    return replace(_apply_decisions(scan, counting), reviewers=dict(sorted(people.items())))
 
 
 def _apply_to_task(task: ScanTask, decisions: Iterable[Decision]) -> ScanTask:
     clicks = list[Click]()
     for one in sorted(decisions, key=lambda one: one.subject):
         if one.decision is DecisionKind.POSE:
-            task = task.changed(pose=one.pose)
+            task = task.with_options(pose=one.pose)
         elif one.decision is DecisionKind.PLACE and one.subject[2] == "fiducial":
             assert one.col_px is not None
             assert one.row_px is not None
             clicks.append(Click(one.point, one.col_px, one.row_px))
-    return task.changed(clicks=tuple(clicks))
+    return task.with_options(clicks=tuple(clicks))
 
 
-def _changed(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:
+def _apply_decisions(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:
     image, marks = scan.frame.image, scan.frame.marks
     return scan.changed([_apply_to_mark(mark, counting.get((image, mark.point, mark.kind))) for mark in marks])
 
@@ -161,21 +163,21 @@ def _apply_to_mark(mark: MarkMeasurement, decision: Decision | None) -> MarkMeas
 
 def tell_inapplicable(
     project: Project,
-    judging: Judging,
+    check_run: CheckRun,
     decisions: Mapping[str, Sequence[Decision]],
     counting: Mapping[str, Mapping[About, Decision]],
 ) -> None:
-    """Store messages about the decisions that a judging could not apply. decisions, counting: by image, all, and those
-    in force."""
-    lines = sorted([*unknown_images(project), *_known_images(project, judging, decisions, counting)])
+    """Store messages about the decisions that a check run could not apply. decisions, counting: by image, all, and
+    those in force."""
+    lines = sorted([*unknown_images(project), *_known_images(project, check_run, decisions, counting)])
     messages = [f"line {number}: {why}" for number, why in lines]
-    judging.store.remember(_INAPPLICABLE, {"digest": judging.digest, "lines": messages})
+    check_run.database.remember(_INAPPLICABLE, {"digest": check_run.digest, "lines": messages})
 
 
-def inapplicable(judging: Judging | None) -> tuple[str, ...]:
-    """Messages about the decisions that a judging could not apply, shortened."""
-    kept = (judging and judging.store.recall(_INAPPLICABLE)) or {}
-    return shortened(kept["lines"]) if judging and kept.get("digest") == judging.digest else ()
+def inapplicable(check_run: CheckRun | None) -> tuple[str, ...]:
+    """Messages about the decisions that a check run could not apply, shortened."""
+    kept = (check_run and check_run.database.recall(_INAPPLICABLE)) or {}
+    return shortened(kept["lines"]) if check_run and kept.get("digest") == check_run.digest else ()
 
 
 def shortened(lines: Sequence[str]) -> tuple[str, ...]:
@@ -198,7 +200,7 @@ def unknown_images(project: Project) -> Iterator[tuple[int, str]]:
 
 def _known_images(
     project: Project,
-    judging: Judging,
+    check_run: CheckRun,
     every: Mapping[str, Sequence[Decision]],
     counting: Mapping[str, Mapping[About, Decision]],
 ) -> Iterator[tuple[int, str]]:
@@ -209,14 +211,14 @@ def _known_images(
         "select image, point, kind, causes is not null from checked_mark "
         "where judging = ? and image in (select value from json_each(?))"
     )
-    rows = judging.store.connection.execute(query, (judging.row, json.dumps(list(decisions))))
+    rows = check_run.database.connection.execute(query, (check_run.row, json.dumps(list(decisions))))
     for image, *mark, is_measured in rows:
         marks[image][mark[0], mark[1]] = bool(is_measured)
     for image, own in decisions.items():
         stacks = dict[About, list[Decision]]()
         for one in own:
             if one.decision is DecisionKind.UNDO and not stacks.get(one.subject):
-                yield one.line, f"there is nothing to undo about {_named(one)}."
+                yield one.line, f"there is nothing to undo about {_decision_subject(one)}."
             push_decision(stacks, one)
         for about, stack in stacks.items():
             if stack and (why := _why(stack[-1], counting[image].get(about), marks[image])):
@@ -230,11 +232,12 @@ def _why(one: Decision, counted: Decision | None, marks: Marks) -> str:
         hint = did_you_mean(point, [name for name, of_kind in marks if of_kind == kind])
         return f"image {one.image!r} has no {kind} {point!r}.{hint}"
     if counted != one:
-        return f"what was decided about {_named(one)} is of an earlier result. Look again in `reseau review`."
+        subject = _decision_subject(one)
+        return f"what was decided about {subject} is of an earlier result. Look again in `reseau review`."
     if one.decision is DecisionKind.ACCEPT and not marks[point, kind]:
-        return f"nothing was measured of {_named(one)} that could be accepted. Place it in `reseau review`."
+        return f"nothing was measured of {_decision_subject(one)} that could be accepted. Place it in `reseau review`."
     return ""
 
 
-def _named(one: Decision) -> str:
+def _decision_subject(one: Decision) -> str:
     return f"{one.subject[2]} {one.point!r} of image {one.image!r}" if one.point else f"image {one.image!r}"

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from pipeline.errors import InputError, what_to_do_about_store
+from pipeline.errors import InputError, what_to_do_about_database
 from pipeline.results.measured_record import MARK_COLUMNS
 
-STORE_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # damaged files: even SQLite's message may be undecodable
+DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # damaged files: even SQLite's message may be undecodable
 APPLICATION = 0x52455345  # "RESE": identifies the file for `file` and this program
 MARKS = ", ".join(("number", *MARK_COLUMNS))
 
@@ -135,7 +135,7 @@ class _RowsDigest:
 
 
 def _digested_columns() -> dict[str, tuple[str, ...]]:
-    """Columns of the rows that have a digest, by table; of checked frames without the judging, so that they can be
+    """Columns of the rows that have a digest, by table; of checked frames without the check run, so that they can be
     copied to another."""
     with closing(sqlite3.connect(":memory:")) as db:
         db.executescript(_FIRST)
@@ -191,7 +191,7 @@ def _digest(table: str, name: str) -> str:
     return f"row_digest({', '.join(f'{name}.{column}' for column in COLUMNS[table])})"
 
 
-# Frames of every judging with their scan and raw result. is_sound: whether the rows match their digests; is_whole:
+# Frames of every check run with their scan and raw result. is_sound: whether the rows match their digests; is_whole:
 # whether their marks do, too.
 _CHECKED_FRAMES = f"""
 create temp view checked_frame as
@@ -229,23 +229,23 @@ def damaged_result(image: str, path: object) -> DamagedError:
     )
 
 
-def damaged_judging(path: object) -> DamagedError:
+def damaged_check_run(path: object) -> DamagedError:
     return DamagedError(
         f"{path}: the list of checked images is damaged (digest differs). "
         "Run `reseau measure --retry`, which checks all images again."
     )
 
 
-def check_judging(db: sqlite3.Connection, judging: int, path: object) -> None:
-    """Raise DamagedError where a judging is damaged or lacks frames."""
+def verify_check_run(db: sqlite3.Connection, check_run: int, path: object) -> None:
+    """Raise DamagedError where a check run is damaged or lacks frames."""
     query = f"select 1 from judging where id = ? and {is_sound('judging')} and frames_digest is {FRAMES_DIGEST}"
-    if db.execute(query, (judging,)).fetchone() is None:
-        raise damaged_judging(path)
+    if db.execute(query, (check_run,)).fetchone() is None:
+        raise damaged_check_run(path)
 
 
-def damaged_frames(db: sqlite3.Connection, judging: int) -> dict[int, str]:
-    """{result: image} of the frames of a judging whose raw result, scan or checked marks are damaged."""
-    return dict(db.execute("select result, name from checked_frame where judging = ? and not is_whole", (judging,)))
+def damaged_frames(db: sqlite3.Connection, check_run: int) -> dict[int, str]:
+    """{result: image} of the frames of a check run whose raw result, scan or checked marks are damaged."""
+    return dict(db.execute("select result, name from checked_frame where judging = ? and not is_whole", (check_run,)))
 
 
 @dataclass(frozen=True)
@@ -274,7 +274,7 @@ class Database:
     def __init__(self, path: Path) -> None:
         """Open or create a file. Raises InputError for a file that is no such database."""
         self.path = path
-        self.connection = opened(path, self.schema)
+        self.connection = open_database(path, self.schema)
 
     def __enter__(self) -> Self:
         return self
@@ -283,8 +283,8 @@ class Database:
         """Close the file. Raises InputError for errors of SQLite in the block, since any read of a damaged file may
         cause one."""
         self.close()
-        if isinstance(error, STORE_ERRORS):
-            raise _store_error(self.path, self.schema, error) from error
+        if isinstance(error, DATABASE_ERRORS):
+            raise _database_error(self.path, self.schema, error) from error
 
     def close(self) -> None:
         self.connection.close()
@@ -338,7 +338,7 @@ def single_writer(path: Path) -> Iterator[None]:
             is_ours = lock.exists()  # else the other process has ended just now
         except sqlite3.OperationalError as error:
             if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
-                raise _store_error(lock, MEASUREMENTS, error) from error
+                raise _database_error(lock, MEASUREMENTS, error) from error
             is_ours = False
         if not is_ours:
             raise InputError(
@@ -352,7 +352,7 @@ def single_writer(path: Path) -> Iterator[None]:
                 lock.unlink(missing_ok=True)
 
 
-def opened(path: Path, schema: Schema = MEASUREMENTS) -> sqlite3.Connection:
+def open_database(path: Path, schema: Schema = MEASUREMENTS) -> sqlite3.Connection:
     """Open a file and migrate it to this version, each step completely or not at all; create it where there is none.
 
     Raises InputError for a file of another kind or of a later version.
@@ -376,8 +376,8 @@ def opened(path: Path, schema: Schema = MEASUREMENTS) -> sqlite3.Connection:
             connection.execute(_CHECKED_FRAMES)
     except BaseException as error:
         connection.close()  # which rolls back an unfinished step
-        if isinstance(error, STORE_ERRORS):
-            raise _store_error(path, schema, error) from error
+        if isinstance(error, DATABASE_ERRORS):
+            raise _database_error(path, schema, error) from error
         raise
     return connection
 
@@ -392,8 +392,8 @@ def _connection(path: Path) -> sqlite3.Connection:
     return sqlite3.connect(name, timeout=60.0, isolation_level=None, uri=is_address)
 
 
-def _store_error(path: Path, schema: Schema, error: Exception) -> InputError:
-    next_step = what_to_do_about_store(error) or (_RETRY if isinstance(error, sqlite3.IntegrityError) else _MOVE)
+def _database_error(path: Path, schema: Schema, error: Exception) -> InputError:
+    next_step = what_to_do_about_database(error) or (_RETRY if isinstance(error, sqlite3.IntegrityError) else _MOVE)
     return InputError(f"{path}: cannot be used as a database of {schema.what} ({error}). {next_step}")
 
 

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pipeline.archive.checked_results import latest
-from pipeline.archive.results_database import Store
+from pipeline.archive.results_database import ResultsDatabase
 from pipeline.archive.review_decisions import (
     decisions_hash,
     group_decisions,
@@ -79,21 +79,21 @@ class ArchiveStatus:
 def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
     """Status from the store and the files' sizes and times; of files of another time the content is compared.
 
-    path: of the store; None for the project's.
+    path: of the database; None for the project's.
     """
     path = path or project.measurement_path
     rows, idle = dict[str, list[Any]](), tuple[str, ...]()
     if path.exists():
-        with Store(path) as store:
-            judging = latest(store)
-            if judging is not None:
-                judging.check()
-            for *row, is_whole in store.connection.execute(_QUERY, (-1 if judging is None else judging.row,)):
+        with ResultsDatabase(path) as database:
+            check_run = latest(database)
+            if check_run is not None:
+                check_run.check()
+            for *row, is_whole in database.connection.execute(_QUERY, (-1 if check_run is None else check_run.row,)):
                 uri, *_, request, _ = row
                 if not is_whole:  # a damaged row counts as a failure
                     row[_VERDICT:] = [str(Verdict.FAILED), _DAMAGED, str(FailureCode.DAMAGED), None, "", request, None]
                 rows[uri] = row
-            idle = inapplicable(judging)
+            idle = inapplicable(check_run)
     files, scans = FileStates(project.path.resolve().parent), []
     request_hash, decisions = request_hasher(project), group_decisions(project.decisions)
     for name, file in as_named(project.scans).items():

@@ -14,7 +14,7 @@ from measure.errors import MeasurementError
 from measure.scans.opening import open_scan
 from measure.scans.remote import scan_path
 from measure.scans.scan import Scan
-from pipeline.archive.schema import STORE_ERRORS, Database, Schema
+from pipeline.archive.schema import DATABASE_ERRORS, Database, Schema
 from pipeline.errors import InputError
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.results.thumbnail import WHOLE, Thumbnail, ThumbnailRow, cut
@@ -35,8 +35,8 @@ _DIGEST = f"row_digest({_COLUMNS})"
 _OFF_MIDDLE = 0.25  # fraction of a thumbnail's width: a mark farther off its middle was measured again since
 
 
-class ThumbnailStore(Database):
-    """Open store of thumbnails beside a results database; closed at the end of the `with` block."""
+class ThumbnailDatabase(Database):
+    """Open database of thumbnails beside a results database; closed at the end of the `with` block."""
 
     schema = Schema(0x52455354, 2, (_FIRST,), "thumbnails")  # "REST"
 
@@ -60,7 +60,7 @@ class ThumbnailStore(Database):
             found = self.connection.execute(
                 f"select {_COLUMNS} from thumbnail where {where}", (fingerprint, point, kind)
             ).fetchone()
-        except STORE_ERRORS:  # fall back to the scan itself
+        except DATABASE_ERRORS:  # fall back to the scan itself
             return None
         return None if found is None else Thumbnail.from_row(found)
 
@@ -75,7 +75,7 @@ class ThumbnailStore(Database):
         columns = f"fingerprint, {_COLUMNS}, digest"
         for measurement in measurements:
             if (path := thumbnails_path(measurement)).is_file():
-                ThumbnailStore(measurement).close()
+                ThumbnailDatabase(measurement).close()
                 self.connection.execute("attach ? as other", (str(path),))
                 self.connection.execute(
                     f"insert or ignore into thumbnail ({columns}) select {columns} from other.thumbnail"
@@ -106,10 +106,10 @@ class Thumbnails:
         self._scans = {scan.frame.image: scan for scan in scans}
         self._marks = {(s.frame.image, m.point, m.kind == "fiducial"): m for s in scans for m in s.frame.marks}
         self._fingerprints = fingerprints
-        self._kept: ThumbnailStore | None = None
+        self._kept: ThumbnailDatabase | None = None
         if thumbnails_path(measurement).exists():
             with suppress(InputError):  # a damaged file: thumbnails are cut from the scans instead
-                self._kept = ThumbnailStore(measurement)
+                self._kept = ThumbnailDatabase(measurement)
         self._open: tuple[Path, Scan] | None = None
 
     def __enter__(self) -> Self:

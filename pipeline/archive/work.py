@@ -15,8 +15,8 @@ from measure.errors import MeasurementError
 from measure.scans.remote import scan_path, whole_file
 from pipeline.archive import review_decisions
 from pipeline.archive.checked_results import CheckedResult
-from pipeline.archive.results_database import Kept, Store
-from pipeline.archive.thumbnails import ThumbnailStore
+from pipeline.archive.results_database import Kept, ResultsDatabase
+from pipeline.archive.thumbnails import ThumbnailDatabase
 from pipeline.files.decisions_file import About, Decision
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_measurement import MeasuredFile, ended_scan, measure_file, reads_writing
@@ -36,13 +36,18 @@ class Work:
     """Measurement of scans on request: stored results are read, missing ones measured and stored at once."""
 
     def __init__(
-        self, project: Project, store: Store, executor: Executor, options: WorkOptions, thumbnails: ThumbnailStore
+        self,
+        project: Project,
+        database: ResultsDatabase,
+        executor: Executor,
+        options: WorkOptions,
+        thumbnails: ThumbnailDatabase,
     ) -> None:
-        self._project, self._store, self._executor, self._thumbnails = project, store, executor, thumbnails
+        self._project, self._database, self._executor, self._thumbnails = project, database, executor, thumbnails
         self._at_a_time = options.workers or os.cpu_count() or 1
         self._only_kept = options.only_kept
         self._folder = project.path.resolve().parent
-        self._identities, self._rows = store.identities(), store.fingerprints()
+        self._identities, self._rows = database.identities(), database.fingerprints()
         self._files = FileStates(self._folder)
         self._states: dict[str, FileState] = {}
         self._asked = review_decisions.request_hasher(project)
@@ -63,7 +68,7 @@ class Work:
         """Measure the missing scans of the project and report how many there are. The scans are not held in memory."""
         known, missing = self._stored_rows(tasks)
         now = sum(row in self._now for row in known.values())  # measured for other scans in the steps before
-        self._store.set_current({row: self._asked(name) for name, row in known.items()})
+        self._database.set_current({row: self._asked(name) for name, row in known.items()})
         if known:
             rest = {"stored already": len(known) - now, "in this run": now, "to go": len(missing)}
             reporter.say(count_sentence("measured", len(known), len(tasks), rest))
@@ -72,12 +77,12 @@ class Work:
 
     def read(self, name: str) -> MeasuredScan:
         """Scan of an image as last requested, with all decisions applied except acceptance (`before_checks`)."""
-        scan = self._store.scan(self.results[name], name, self._folder)
+        scan = self._database.scan(self.results[name], name, self._folder)
         return review_decisions.before_checks(scan, self.counting[name])
 
     def picture(self, scan: MeasuredScan) -> Array | None:
         """Reduced grey values (rows, columns) of a whole scan, stored or read again; None where it cannot be read."""
-        key = self._store.first("select fingerprint from result where id = ?", self.results[scan.frame.image])
+        key = self._database.first("select fingerprint from result where id = ?", self.results[scan.frame.image])
         if (stored := self._thumbnails.get(key)) is not None:
             return np.asarray(stored.pixels)
         try:
@@ -87,14 +92,14 @@ class Work:
             return None
         return grey.astype(float)
 
-    def written(self, names: Sequence[str]) -> list[str]:
+    def names_with_writing(self, names: Sequence[str]) -> list[str]:
         """Images on whose scans writing was found."""
-        written = self._store.written()
+        written = self._database.results_with_writing()
         return [name for name in names if self.results[name] in written]
 
     def read_writing(self, name: str) -> MeasuredScan:
         """Scan of an image as last requested, without marks, problems and notes."""
-        scan = self._store.scan(self.results[name], name, self._folder, with_marks=False)
+        scan = self._database.scan(self.results[name], name, self._folder, with_marks=False)
         return replace(scan, frame=replace(scan.frame, problems=()), notes=())
 
     def decisions_hash(self, name: str) -> str:
@@ -163,7 +168,7 @@ class Work:
 
         def pose_of(key: str) -> str | None:
             row = self._rows.get(key)
-            return None if row is None else self._store.pose_name(row)
+            return None if row is None else self._database.pose_name(row)
 
         known, missing = dict[str, int](), list[ScanTask]()
         for task in tasks:
@@ -171,7 +176,7 @@ class Work:
             if decisions := self.decisions.get(task.name):
                 reviewed_file = identity or FileIdentity(self.state(task), parts_hash(scan_path(task.scan)))
                 reviewed, self.counting[task.name] = review_decisions.apply_decisions(
-                    task, decisions, partial(_key, reviewed_file), pose_of, self._store.later_keys
+                    task, decisions, partial(_key, reviewed_file), pose_of, self._database.later_keys
                 )
             row = None if identity is None else self._rows.get(_key(identity, reviewed))
             if row is None:
@@ -195,7 +200,7 @@ class Work:
             kept = Kept(identity, _options_json(task), file.scan, file.bytes_read, camera.path.name)
             if file.thumbnails:
                 self._thumbnails.keep(kept.fingerprint, file.thumbnails)
-            row = self._store.keep(kept, *((task.name, self._asked(task.name)) if as_scans else ()))
+            row = self._database.keep(kept, *((task.name, self._asked(task.name)) if as_scans else ()))
             self._identities[identity.state.uri], self._rows[kept.fingerprint] = identity, row
             self._now.add(row)
             self.results[task.name] = row

@@ -128,7 +128,7 @@ class TrackObservation:
 
 
 @dataclass(frozen=True)
-class Mapped:
+class Reconstruction:
     """Result of COLMAP, in a coordinate system of its own.
 
     poses: by image, rotation (3, 3) and translation (3,) to axes x right, y down, z forward; tracks: by point, its
@@ -155,13 +155,13 @@ class FeaturePrecision:
         return np.array([self.grain_px**2, self.share**2])
 
 
-def tie_marks(mapped: Mapped, pictures: Sequence[BlockPicture]) -> tuple[ComparatorPoint, ...]:
+def tie_marks(block: Reconstruction, pictures: Sequence[BlockPicture]) -> tuple[ComparatorPoint, ...]:
     """Tie marks of the selected tracks in the scans, with standard deviations estimated by feature size."""
     by_image = {picture.image: picture for picture in pictures}
-    precision = feature_precision(mapped)
+    precision = feature_precision(block)
     marks = []
-    for number in chosen_tracks(mapped, by_image, precision):
-        for sight in mapped.tracks[number]:
+    for number in choose_tracks(block, by_image, precision):
+        for sight in block.tracks[number]:
             picture = by_image[sight.image]
             shown = picture.scan_place(picture.lattice.camera_from_pixel(np.array([sight.col, sight.row])))
             if shown is None:
@@ -173,14 +173,14 @@ def tie_marks(mapped: Mapped, pictures: Sequence[BlockPicture]) -> tuple[Compara
     return tuple(marks)
 
 
-def feature_precision(mapped: Mapped) -> FeaturePrecision:
+def feature_precision(block: Reconstruction) -> FeaturePrecision:
     """Estimate the precision of features from the reprojection errors of tracks with three or more observations.
 
     Of the 2n coordinates of a track, three degrees of freedom determine the point. The initial value is the median of
     all squares (that of chi-square with two degrees of freedom is 2 ln 2). Then the squares of consistent tracks are
     fitted, each weighted by its expectation. Raises InputError where no track has three observations.
     """
-    tracks = [track for track in mapped.tracks.values() if len(track) >= _FEWEST_SIGHTS]
+    tracks = [track for track in block.tracks.values() if len(track) >= _FEWEST_SIGHTS]
     if not tracks:
         raise InputError("COLMAP found no point in three frames: a block needs more overlap.")
     squares = np.concatenate([_squares_px2(track) for track in tracks])
@@ -213,20 +213,22 @@ def _design(track: Sequence[TrackObservation]) -> Array:
     return np.stack([np.full(len(track), free), free * (free * squares + (1.0 - free) * squares.mean())], axis=1)
 
 
-def chosen_tracks(mapped: Mapped, pictures: Mapping[str, BlockPicture], precision: FeaturePrecision) -> list[int]:
+def choose_tracks(
+    block: Reconstruction, pictures: Mapping[str, BlockPicture], precision: FeaturePrecision
+) -> list[int]:
     """Select consistent tracks for each cell of each image: the longest ones, among these the most precise."""
     usable = [
         number
-        for number, track in mapped.tracks.items()
+        for number, track in block.tracks.items()
         if len({sight.image for sight in track}) == len(track)
         and (_squares_px2(track) / (_design(track) @ precision.variances_px2)).mean() < _CONSISTENT**2
     ]
-    usable.sort(key=lambda number: (-len(mapped.tracks[number]), max(s.size_px for s in mapped.tracks[number])))
+    usable.sort(key=lambda number: (-len(block.tracks[number]), max(s.size_px for s in block.tracks[number])))
     taken: dict[tuple[str, int, int], int] = defaultdict(int)
     chosen = []
     for number in usable:
         cells = []
-        for sight in mapped.tracks[number]:
+        for sight in block.tracks[number]:
             picture = pictures[sight.image]
             column = int(CELLS * sight.col / picture.lattice.width_px)
             cells.append((picture.image, column, int(CELLS * sight.row / picture.lattice.height_px)))
@@ -237,8 +239,8 @@ def chosen_tracks(mapped: Mapped, pictures: Mapping[str, BlockPicture], precisio
     return sorted(chosen)
 
 
-def oriented_by_control(
-    mapped: Mapped,
+def orient_by_control(
+    block: Reconstruction,
     pictures: Sequence[BlockPicture],
     marks: Sequence[ComparatorPoint],
     points: Mapping[str, ObjectPoint],
@@ -266,11 +268,11 @@ def oriented_by_control(
     for mark in marks:
         if mark.kind == "target" and mark.status.is_observation and mark.image in scans:
             frame, scan = scans[mark.image]
-            if frame in mapped.poses and len(given.get(mark.point, ())) == 3:
+            if frame in block.poses and len(given.get(mark.point, ())) == 3:
                 assert mark.xy_mm is not None
                 pixel = pixel_from_comparator(mark.xy_mm[None], scan.chain.pitch_um)
                 (x, y), (c, x0, y0) = scan.chain.frame_from_scan(pixel)[0][0], camera_rays[frame]
-                rotation, translation = mapped.poses[frame]
+                rotation, translation = block.poses[frame]
                 ray = -rotation.T @ translation, rotation.T @ np.array([(x - x0) / c, (y0 - y) / c, 1.0])
                 rays[mark.point].setdefault(frame, ray)
     control = sorted(point for point, own in rays.items() if len(own) > 1)
@@ -283,17 +285,17 @@ def oriented_by_control(
     numbers, centers, directions = (np.array(each) for each in zip(*numbered, strict=True))
     theirs, _ = intersect(centers, directions, numbers, np.full((len(control), 3), np.nan))
     ours = np.array([given[point] for point in control])
-    stations = {image: -rotation.T @ translation for image, (rotation, translation) in mapped.poses.items()}
+    stations = {image: -rotation.T @ translation for image, (rotation, translation) in block.poses.items()}
     found = np.isfinite(theirs).all(axis=1)
-    block = absolute_orientation(theirs[found], ours[found], np.array(list(stations.values())))
-    if block is None:
+    similarity = absolute_orientation(theirs[found], ours[found], np.array(list(stations.values())))
+    if similarity is None:
         raise InputError(
             "The control points that COLMAP's frames show do not determine how the block lies. "
             "Mark control points that are not on one line, in two frames or more."
         )
     return {
-        image: (np.asarray(Y_DOWN_Z_FORWARD @ rotation @ block.rotation.T), block.apply(stations[image]))
-        for image, (rotation, _) in mapped.poses.items()
+        image: (np.asarray(Y_DOWN_Z_FORWARD @ rotation @ similarity.rotation.T), similarity.apply(stations[image]))
+        for image, (rotation, _) in block.poses.items()
     }
 
 
@@ -328,15 +330,15 @@ def run_block(
     with _step(seconds, "pictures"):
         pictures = write_pictures(tasks, cameras, folder)
     with _step(seconds, "features, matches and mapping"):
-        found = mapped(pictures, cameras, folder)
+        found = run_colmap(pictures, cameras, folder)
     with _step(seconds, "tracks and exterior orientations"):
         ties = tie_marks(found, pictures)
         interior = {picture.image: given_interior(cameras[picture.camera]) for picture in pictures}
-        poses = oriented_by_control(found, pictures, marks, project.object_points, interior)
-        own = written_block(project, folder, (*marks, *ties), poses)
+        poses = orient_by_control(found, pictures, marks, project.object_points, interior)
+        own = write_block(project, folder, (*marks, *ties), poses)
     exterior = own.given_images.exterior if own.given_images else {}
     oriented = {project.image_frame(image) for image, each in exterior.items() if each is not None}
-    observed = {project.image_frame(image) for image, each in exterior.items() if _observed(each).any()}
+    observed = {project.image_frame(image) for image, each in exterior.items() if _observed_elements(each).any()}
     left_out = tuple(sorted({project.image_frame(mark.image) for mark in marks} - oriented))
     lines = [
         f"COLMAP oriented {counted(len(found.poses), 'image')}; {counted(len(ties), 'tie mark')} of "
@@ -376,16 +378,18 @@ def coarse_pitch_um(project: Project) -> float | None:
     return enough if enough > finest else None
 
 
-def written_block(
+def write_block(
     project: Project, folder: Path, marks: Sequence[ComparatorPoint], poses: dict[str, tuple[Array, Array]]
 ) -> Project:
     """Write comparator.csv and images.csv of a block, and return the project that uses them."""
     pitches, given = read_pitches(project.comparator), project.given_images or GivenImages({}, {})
     frames = {mark.image: project.image_frame(mark.image) for mark in marks}
     observed = {
-        frames[image]: each for image, each in given.exterior.items() if image in frames and _observed(each).any()
+        frames[image]: each
+        for image, each in given.exterior.items()
+        if image in frames and _observed_elements(each).any()
     }
-    oriented = poses.keys() | {frame for frame, each in observed.items() if _observed(each).all()}
+    oriented = poses.keys() | {frame for frame, each in observed.items() if _observed_elements(each).all()}
     kept = [mark for mark in marks if mark.kind != "target" or frames[mark.image] in oriented]
     write_comparator(folder / "comparator.csv", kept, pitches)
     exterior: dict[str, Exterior | None] = {}
@@ -415,7 +419,7 @@ def written_block(
     )
 
 
-def _observed(exterior: Exterior | None) -> Mask:
+def _observed_elements(exterior: Exterior | None) -> Mask:
     """(6,) mask of the elements with standard deviations."""
     return np.isfinite(exterior.sigmas) if exterior else np.zeros(len(ELEMENTS), bool)
 
@@ -430,7 +434,7 @@ def _exterior(pose: tuple[Array, Array] | None, given: Exterior | None) -> Exter
     rotation, station = pose
     angles = angles_near(rotation, given.values[3:])
     values = np.concatenate([station + rotation.T @ np.array(given.antenna), angles])
-    return replace(given, values=np.where(_observed(given), given.values, values))
+    return replace(given, values=np.where(_observed_elements(given), given.values, values))
 
 
 @contextmanager
@@ -460,7 +464,7 @@ def write_pictures(
     for task in tasks:
         camera = cameras[task.camera]
         lattice = camera_lattice(camera, task.pitch_mm)
-        picture, mask = _cut(task.target, lattice)
+        picture, mask = _frame_on_lattice(task.target, lattice)
         mask = mask & _usable(camera, lattice)
         name = f"{file_word(task.camera)}/{task.image.replace('/', '_')}.png"
         if images.setdefault(name, task.image) != task.image:
@@ -478,7 +482,7 @@ def write_pictures(
     return tuple(made)
 
 
-def _cut(path: Path, lattice: Canvas) -> tuple[Array, Mask]:
+def _frame_on_lattice(path: Path, lattice: Canvas) -> tuple[Array, Mask]:
     """Grey values of a resampled frame on the grid, and the mask of valid pixels."""
     with tifffile.TiffFile(path) as file:
         description = json.loads(file.pages.first.description)
@@ -517,7 +521,7 @@ def _eight_bits(picture: Array, mask: Mask) -> Picture:
     return np.asarray(np.clip(np.rint(scaled), 0, 255).astype(np.uint8))
 
 
-def mapped(pictures: Sequence[BlockPicture], cameras: dict[str, CameraFile], folder: Path) -> Mapped:
+def run_colmap(pictures: Sequence[BlockPicture], cameras: dict[str, CameraFile], folder: Path) -> Reconstruction:
     """Run COLMAP with fixed cameras and return the largest part of the block that it orients. Raises InputError where
     it orients nothing."""
     pycolmap = quiet_colmap()
@@ -558,7 +562,7 @@ def quiet_colmap() -> Any:
     return pycolmap
 
 
-def read_model(model: Any, database: Any, pictures: Sequence[BlockPicture]) -> Mapped:
+def read_model(model: Any, database: Any, pictures: Sequence[BlockPicture]) -> Reconstruction:
     """Content of a reconstruction, by the names of the images here; feature sizes are read from its database."""
     names = {picture.name: picture.image for picture in pictures}
     images = {number: model.images[number] for number in model.reg_image_ids()}
@@ -580,7 +584,7 @@ def read_model(model: Any, database: Any, pictures: Sequence[BlockPicture]) -> M
             size_px = float(sizes_px[element.image_id][row])
             sights.append(TrackObservation(names[image.name], float(place[0]), float(place[1]), size_px, off_px))
         tracks[int(number)] = sights
-    return Mapped(poses, tracks)
+    return Reconstruction(poses, tracks)
 
 
 def _extract(pycolmap: Any, database: Path, folder: Path, pictures: Sequence[BlockPicture], camera: CameraFile) -> None:

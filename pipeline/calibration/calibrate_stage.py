@@ -21,6 +21,7 @@ from adjust.solution.result import Adjustment
 from measure import MeasurementError, open_scan
 from measure.boards.find import recognise_board
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
+from pipeline.calibration import project_files
 from pipeline.calibration.intrinsics import (
     CameraIntrinsics,
     LensChoice,
@@ -30,13 +31,6 @@ from pipeline.calibration.intrinsics import (
     choose_lens,
 )
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures, find_turns
-from pipeline.calibration.project_files import (
-    CalibrationOptions,
-    board_options,
-    camera_files,
-    check_folder,
-    write_project,
-)
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
@@ -147,15 +141,15 @@ class CalibrationResult(PlottedResult):
             console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
-def _calibrated(
-    given: Sequence[Path], out: Path, options: CalibrationOptions, reporter: Reporter, workers: int | None
+def _calibrate_cameras(
+    given: Sequence[Path], out: Path, options: project_files.CalibrationOptions, reporter: Reporter, workers: int | None
 ) -> CalibrationResult:
     """Calibrate each camera separately, so that a failure does not affect the others."""
     pictures = find_pictures(given, out)
-    check_folder(out, pictures)
+    project_files.check_folder(out, pictures)
     first: LensModel = "opencv4" if options.lens == "auto" else options.lens
     lenses = dict.fromkeys((camera.name for camera in pictures.cameras), first)
-    project = write_project(out, pictures, options, lenses)
+    project = project_files.write_project(out, pictures, options, lenses)
     work = WorkOptions(workers=workers)
     run_measure(project, reporter, work)
     marks = read_comparator(project.comparator)
@@ -171,14 +165,14 @@ def _calibrated(
                     camera = find_turns(project, own, camera)
                     cameras = (camera if each.name == camera.name else each for each in pictures.cameras)
                     pictures = replace(pictures, cameras=tuple(cameras))
-                    project = write_project(out, pictures, options, lenses)
+                    project = project_files.write_project(out, pictures, options, lenses)
                 _check_count(camera, left_out)
                 adjustment, choice = adjust_marks(project, own), None
                 if options.lens == "auto":
                     choice = _chosen_lens(project, adjustment, camera, options)
                     if choice.model != first:
                         lenses[camera.name] = choice.model
-                        adjustment = adjust_marks(write_project(out, pictures, options, lenses), own)
+                        adjustment = adjust_marks(project_files.write_project(out, pictures, options, lenses), own)
                 if not adjustment.converged:
                     why = " ".join(adjustment.warnings[:1])
                     raise InputError(
@@ -191,7 +185,7 @@ def _calibrated(
     if not adjustments:
         raise InputError(_nothing(pictures, left_out, not_calibrated))
     calibrated, names = pictures.select(adjustments)
-    project = write_project(out, calibrated, options, lenses)
+    project = project_files.write_project(out, calibrated, options, lenses)
     if any(name != earlier for earlier, name in names.items()):  # the cameras left out had folders of their own
         left_out = {names[image]: why for image, why in left_out.items() if image in names}
         marks = tuple(replace(mark, image=names[mark.image]) for mark in marks if mark.image in names)
@@ -209,7 +203,7 @@ def _calibrated(
         found.append(
             camera_intrinsics(adjustment, each, options.pixel_mm, own_reasons, choice, options.pitch_um, check)
         )
-    files = dict(camera_files(found, out, options.ros))
+    files = dict(project_files.camera_files(found, out, options.ros))
     for path, text in files.items():
         write_atomically(path, text)
     written = (*files, project.report_path, project.path)
@@ -246,7 +240,7 @@ def _check_count(camera: CameraPictures, left_out: Mapping[str, str]) -> None:
 
 
 def _chosen_lens(
-    project: Project, first: Adjustment, camera: CameraPictures, options: CalibrationOptions
+    project: Project, first: Adjustment, camera: CameraPictures, options: project_files.CalibrationOptions
 ) -> LensChoice:
     """Select the lens model by cross-validation. All marks get one standard deviation, large enough for models with
     larger misfit than the first."""
@@ -336,7 +330,7 @@ def calibrate(
     """
     if lens not in LENSES:
         raise InputError(f"--lens {lens}: possible are {', '.join(LENSES)}.{did_you_mean(lens, LENSES)}")
-    given = board_options(kind, board, square, marker, dictionary, legacy, first_id)
-    options = CalibrationOptions(given, LENSES[lens], square_pixels, pitch_um, ros)
+    given = project_files.board_options(kind, board, square, marker, dictionary, legacy, first_id)
+    options = project_files.CalibrationOptions(given, LENSES[lens], square_pixels, pitch_um, ros)
     paths = [pictures] if isinstance(pictures, str | os.PathLike) else pictures
-    return _calibrated([Path(path) for path in paths], Path(out), options, reporter or Reporter(), workers)
+    return _calibrate_cameras([Path(path) for path in paths], Path(out), options, reporter or Reporter(), workers)

@@ -184,7 +184,7 @@ def status(
 
 def merge(
     project: shared.ProjectFile,
-    stores: Annotated[
+    databases: Annotated[
         list[Path], typer.Argument(metavar="DB...", help="Results databases of the parts.", show_default=False)
     ],
     as_json: shared.AsJson = False,
@@ -193,7 +193,7 @@ def merge(
     from pipeline.progress import Reporter
     from pipeline.stages import run_merge
 
-    taken, summary = run_merge(shared.read(project), stores, Reporter())
+    taken, summary = run_merge(shared.read(project), databases, Reporter())
     if not as_json:
         left_out = {one.path: f", {one.damaged} damaged and left out" if one.damaged else "" for one in taken}
         shared.say(*(f"{o.path}: {counted(o.results, 'result')}, {o.new} of them new{left_out[o.path]}" for o in taken))

@@ -124,8 +124,8 @@ def summary_steps(project: Path, summary: "Summary") -> Iterator[str]:
     """Suggest steps after a stage, from its summary. project: the project file."""
     files, adjustment = summary.files, summary.adjustment
     if summary.parts:
-        stores = shlex.quote(str(next(iter(files.values())).parent))
-        words = f"merge {shlex.quote(str(project))} {stores}/measurement.*-of-{summary.parts}.db"
+        databases = shlex.quote(str(next(iter(files.values())).parent))
+        words = f"merge {shlex.quote(str(project))} {databases}/measurement.*-of-{summary.parts}.db"
         yield command_step(words, why="when all parts are measured")
         return
     if "report" in files:

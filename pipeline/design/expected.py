@@ -8,8 +8,9 @@ from functools import cached_property, partial
 
 import numpy as np
 
+from adjust.functional_model.distortion_models import UM_PER_MM
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Prior
+from adjust.functional_model.lens import INTERIOR_NAMES, Prior
 from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles, rotation_from_vector
 from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.estimates import adjusted_lens
@@ -20,7 +21,7 @@ from adjust.solution.adjustment import Options
 from adjust.solution.planning import Plan, plan
 from pipeline.adjusting.network import FEWEST_TARGETS
 from pipeline.design.setup import Setup, planned_network
-from pipeline.results.image_unit import UM_PER_MM
+from pipeline.progress import Count
 from pipeline.types import Array
 from synthetic_images.scene import SceneImage
 
@@ -29,7 +30,6 @@ IN_MM = ("target", "tie", "fiducial", "datum", "scanner", "fiducial distance")
 DIRECTIONS = 36
 QUARTERS = 4
 ROUNDING_UM = 1e-9
-INTERIOR = ("c", "x0", "y0")
 ROUNDING = 1e-9  # relative cut-off of singular values of the null directions
 QUARTER = math.pi / 2  # rad
 FOUND = 100.0  # percent: gain where only the changed plan determines a quantity
@@ -108,7 +108,7 @@ class Expected:
         """
         found = self.plan.sigmas(self._interior, np.eye(len(self._interior))).tolist()
         by_name = dict(zip((each.quantity for each in self._interior), found, strict=True))
-        sigmas = {name: UM_PER_MM * by_name[name] for name in INTERIOR}
+        sigmas = {name: UM_PER_MM * by_name[name] for name in INTERIOR_NAMES}
         sigmas |= {name: by_name[name] for name in self.family_parameters}
         marks = [self.plan.sigma(each) for each in _fiducial_unknowns(self.network.cameras[0])]
         sigmas |= {"fiducials": UM_PER_MM * rms(marks), "ray": self.curve[-1].ray_um}
@@ -174,7 +174,7 @@ class Expected:
     @property
     def _interior(self) -> list[Parameter]:
         """Parameters of the interior orientation and the distortion."""
-        names = (*INTERIOR, *parameter_names(self.network.cameras[0].distortion.family))
+        names = (*INTERIOR_NAMES, *parameter_names(self.network.cameras[0].distortion.family))
         return [Parameter.interior(self.camera, name) for name in names]
 
     def _functions(self, radius_mm: float) -> Array:
@@ -211,7 +211,7 @@ def rms(values: list[float] | Array) -> float:
 # positions of the fiducials, and the rest of the camera in their frame.
 
 
-def alone(expected: Expected) -> Mapping[Parameter, float]:
+def sigmas_of_images_alone(expected: Expected) -> Mapping[Parameter, float]:
     """Standard deviations of the camera's parameters without the pseudo-observations F5 to F9.
 
     mm, and the parameters' own units; inf: not determined. With N the null directions and N_f its rows of the
@@ -221,13 +221,13 @@ def alone(expected: Expected) -> Mapping[Parameter, float]:
     network = expected.network
     camera = network.cameras[0]
     # All parameters are free that are not fixed.
-    fiducials = {id: Fiducial(_freed(mark.x_mm), _freed(mark.y_mm)) for id, mark in camera.fiducials.items()}
-    c, x0, y0 = (prior and _freed(prior) for prior in (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm))
+    fiducials = {id: Fiducial(_free_prior(mark.x_mm), _free_prior(mark.y_mm)) for id, mark in camera.fiducials.items()}
+    c, x0, y0 = (prior and _free_prior(prior) for prior in (camera.principal_distance_mm, camera.x0_mm, camera.y0_mm))
     freed = replace(camera, principal_distance_mm=c, x0_mm=x0, y0_mm=y0, fiducials=fiducials)
     without = replace(network, cameras=(freed,))
     options = Options(expected.setup.settings.datum)
     free = plan(without, planned_network(expected.setup)[1], options, expected.plan.sigma0)
-    interior = [Parameter.interior(camera.name, name) for name in (*INTERIOR, *expected.family_parameters)]
+    interior = [Parameter.interior(camera.name, name) for name in (*INTERIOR_NAMES, *expected.family_parameters)]
     marks = _fiducial_unknowns(camera)
     moved = free.null[[free.adjustment.index(each) for each in (*interior, *marks)]]
     functions = np.eye(len(interior) + len(marks))
@@ -239,7 +239,7 @@ def _fiducial_unknowns(camera: Camera) -> list[Parameter]:
     return [Parameter.fiducial(camera.name, id, axis) for id in camera.fiducials for axis in "xy"]
 
 
-def _freed(prior: Prior) -> Prior:
+def _free_prior(prior: Prior) -> Prior:
     return prior if prior.sigma == 0.0 else Prior(prior.value, np.inf)
 
 
@@ -261,14 +261,11 @@ class Alternative:
         return sum(gains) / len(gains) if gains else 0.0
 
 
-Progress = Callable[[str, int, int], None]
-
-
-def alternatives(basis: Expected, progress: Progress = lambda *_: None) -> tuple[Alternative, ...]:
+def alternatives(basis: Expected, progress: Count = lambda *_: None) -> tuple[Alternative, ...]:
     """Try all kinds of changes, each once. Of the photographs that could be added or rolled, the most useful of each
     kind is kept."""
     setup, tried = basis.setup, defaultdict[int, list[Alternative]](list)
-    kinds = [*_photos(setup), _turned(setup), *([one] for one in _better(setup))]
+    kinds = [*_more_photos(setup), _other_kappas(setup), *([one] for one in _better(setup))]
     changes = [(kind, *each) for kind, some in enumerate(kinds) for each in some]
     for done, (kind, change, changed) in enumerate(changes, 1):
         expected = expect(changed)
@@ -293,13 +290,13 @@ Change = tuple[str, Setup]
 Exterior = tuple[float, float, float, float, float, float]
 
 
-def _photos(setup: Setup) -> Iterator[Iterable[Change]]:
+def _more_photos(setup: Setup) -> Iterator[Iterable[Change]]:
     """One more photograph: each named in the settings; and existing ones, rolled or moved around the field."""
     for photo in setup.settings.photo:
         omega, phi, kappa = (math.radians(angle) for angle in photo.angles_deg)
         image = SceneImage(photo.name, (*photo.position, omega, phi, kappa))
         yield [(f"one more photo: {photo.name}", _add_image(setup, image))]
-    yield _more(setup, "turned by 90 degrees", _rolled)
+    yield _more(setup, "turned by 90 degrees", _turn_kappa)
     center = np.mean([point.xyz for point in setup.points], axis=0)
     axis = np.mean([point.normal for point in setup.points], axis=0)  # in which the targets face
     length = float(np.linalg.norm(axis))
@@ -324,10 +321,10 @@ def _more(setup: Setup, words: str, moved: Callable[[Exterior], Exterior]) -> It
             yield f"one more photo: as {image.name}, {words}", _add_image(setup, new)
 
 
-def _turned(setup: Setup) -> Iterator[Change]:
+def _other_kappas(setup: Setup) -> Iterator[Change]:
     """Another kappa of one photograph."""
     for i, image in enumerate(setup.images):
-        new = replace(image, exterior=_rolled(image.exterior))
+        new = replace(image, exterior=_turn_kappa(image.exterior))
         if len(setup.visible_points(new)) >= FEWEST_TARGETS:
             images = (*setup.images[:i], new, *setup.images[i + 1 :])
             yield f"another kappa: {image.name} turned by 90 degrees", replace(setup, images=images)
@@ -359,5 +356,5 @@ def _add_image(setup: Setup, image: SceneImage) -> Setup:
     return replace(setup, images=(*setup.images, image))
 
 
-def _rolled(exterior: Exterior) -> Exterior:
+def _turn_kappa(exterior: Exterior) -> Exterior:
     return (*exterior[:5], exterior[5] + QUARTER)

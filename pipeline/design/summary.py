@@ -9,14 +9,23 @@ from markupsafe import Markup
 from rich.console import Console
 from rich.text import Text
 
+from adjust.functional_model.distortion_models import UM_PER_MM
 from adjust.problem.parameter import Parameter, description
 from pipeline.design.design_file import Design
-from pipeline.design.expected import FOUND, Alternative, GroupReliability, alone, alternatives, error_unit, expect, rms
+from pipeline.design.expected import (
+    FOUND,
+    Alternative,
+    GroupReliability,
+    alternatives,
+    error_unit,
+    expect,
+    rms,
+    sigmas_of_images_alone,
+)
 from pipeline.design.sweeps import Swept, Variations, over_layouts, sweep
 from pipeline.drawing import svg
 from pipeline.progress import Reporter
 from pipeline.report.numbers import NONE, fixed, significant, typed, value_and_sigma
-from pipeline.results.image_unit import UM_PER_MM
 from pipeline.results.record_json import write_record
 from pipeline.terminal import uncut_table
 from pipeline.text.files import FORMS, check_replaceable, check_writable
@@ -140,7 +149,10 @@ def _tables(design: Design) -> Iterator[PrintedTable]:
     yield "Distortion, sigma in µm", ("radius, mm", "radial", "tangential", "image of a ray"), curve
     places = {id: [Parameter.fiducial(camera, id, axis) for axis in "xy"] for id in expected.fiducials}
     fiducials = [
-        (id, *(_sigma(UM_PER_MM * sigma) for sigma in (*map(plan.sigma, place), *(alone[each] for each in place))))
+        (
+            id,
+            *(_sigma(UM_PER_MM * sigma) for sigma in (*map(plan.sigma, place), *(alone[each] for each in place))),
+        )
         for id, place in places.items()
     ]
     without = ("x', without given values", "y', without given values")
@@ -255,7 +267,7 @@ def run_design(scene_path: Path, out_dir: Path | None, reporter: Reporter) -> De
     with reporter.stage("planning") as count:
         count(scene_path.name, 0, 1)
         expected = expect(setup)
-        without_given = alone(expected)
+        without_given = sigmas_of_images_alone(expected)
         layouts = over_layouts(scene, expected)
     helpful: tuple[Alternative, ...] = ()
     if setup.settings.alternatives:

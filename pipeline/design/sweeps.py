@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from pipeline.design.setup import Setup, scene_setup
 from pipeline.errors import InputError
 from pipeline.files.library import camera_path
 from pipeline.files.object_files import ELEMENTS
+from pipeline.progress import Count
 from pipeline.rendered.scene_file import parse_scene
 from pipeline.rendered.scene_tables import Sweep
 from pipeline.text.toml_tables import Table, read_toml
@@ -23,7 +24,6 @@ Values = dict[str, Any]
 
 EXTERIOR = {name: ("position" if k < 3 else "angles_deg", k % 3) for k, name in enumerate(ELEMENTS)}
 PLANNING_PITCH_UM = 20.0  # default: a scene that is only planned needs no pitch
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Variations:
         values = self.values | {"seed": self.values.get("seed", 1) + layout} if layout else self.values
         return scene_setup(parse_scene(Table(values, self.path, "")))
 
-    def varied(self, number: int, sweep: Sweep, value: float | str) -> "Variations":
+    def with_value(self, number: int, sweep: Sweep, value: float | str) -> "Variations":
         """The scene with the quantity of a sweep set to a value. Raises InputError for an unknown quantity."""
         try:
             values = self._changed_values(sweep.quantity, value)
@@ -199,9 +199,9 @@ class Swept:
         return float(np.polyfit(x, y, 1)[0])
 
 
-def sweep(scene: Variations, number: int, planned: Sweep, progress: Progress = lambda *_: None) -> Swept:
+def sweep(scene: Variations, number: int, planned: Sweep, progress: Count = lambda *_: None) -> Swept:
     """Carry out a sweep. number: of the sweep in the scene, for messages. Raises InputError for an unknown quantity."""
-    varied = [scene.varied(number, planned, value) for value in planned.values]
+    varied = [scene.with_value(number, planned, value) for value in planned.values]
     steps = []
     for done, variation in enumerate(varied, 1):
         value: float | str = planned.values[done - 1]

@@ -60,7 +60,7 @@ class OutFrame:
     is_oriented: bool
     turn: Turn = NOT_TURNED
 
-    def observed(self, fiducials: bool) -> tuple[ComparatorPoint, ...]:
+    def observed_marks(self, fiducials: bool) -> tuple[ComparatorPoint, ...]:
         """Its fiducials, or its object points."""
         return tuple(mark for mark in self.marks if mark.kind != "join" and (mark.kind == "fiducial") == fiducials)
 
@@ -131,10 +131,10 @@ class WholeFrame(OutFrame):
 
     scans: tuple[OutFrame, ...] = ()
 
-    def observed(self, fiducials: bool) -> tuple[ComparatorPoint, ...]:
+    def observed_marks(self, fiducials: bool) -> tuple[ComparatorPoint, ...]:
         """Its fiducials, or its object points; the most precise mark of those observed in several scans."""
         best: dict[str, ComparatorPoint] = {}
-        for mark in (mark for scan in self.scans for mark in scan.observed(fiducials)):
+        for mark in (mark for scan in self.scans for mark in scan.observed_marks(fiducials)):
             best[mark.point] = min(best.get(mark.point, mark), mark, key=_variance)
         return tuple(best.values())
 
@@ -202,7 +202,7 @@ class ImageBlock:
             )
         return self.project.open_scan(frame.image)
 
-    def oriented(self) -> Iterator[OutFrame]:
+    def oriented_frames(self) -> Iterator[OutFrame]:
         return (frame for frame in self.frames if frame.is_oriented)
 
     def whole(self, scans: Iterable[OutFrame]) -> list[WholeFrame]:
@@ -220,7 +220,7 @@ class ImageBlock:
 
     def needs_orientation(self, format: str) -> None:
         """Raise InputError where no image is oriented."""
-        if not any(self.oriented()):
+        if not any(self.oriented_frames()):
             path = self.project.adjustment_path
             has = f"{path} has none" if path.exists() else f"there is no {path}"
             raise InputError(

@@ -83,7 +83,7 @@ def write_geojson(block: ImageBlock, options: ExportOptions) -> Written:
         )
     block.needs_orientation("geojson")
     features, left_out = [], list(block.unoriented_note())
-    for frame in block.whole(block.oriented()):
+    for frame in block.whole(block.oriented_frames()):
         outline = footprint(block, frame)
         if isinstance(outline, str):
             left_out.append(f"{frame.image}: {outline}")
@@ -111,7 +111,7 @@ def footprint(block: ImageBlock, frame: WholeFrame) -> Array | str:
     the reason why there is none."""
     model = frame.model
     assert model is not None
-    heights = [block.points[mark.point][2] for mark in frame.observed(False) if mark.point in block.points]
+    heights = [block.points[mark.point][2] for mark in frame.observed_marks(False) if mark.point in block.points]
     if not heights:
         return "none of its points is adjusted, so the height of the terrain is not known."
     (left, bottom), (right, top) = frame_corners_mm(block, frame)

@@ -77,8 +77,8 @@ def _hindrance(block: ImageBlock, frame: OutFrame) -> str:
             "its scan is mirrored, and Metashape is not known to take that. Resample it (reseau resample) and use the "
             "opencv or colmap export."
         )
-    if len(frame.observed(fiducials=True)) < 3:
-        return f"{len(frame.observed(fiducials=True))} of its fiducials are observed, and three are needed."
+    if len(frame.observed_marks(fiducials=True)) < 3:
+        return f"{len(frame.observed_marks(fiducials=True))} of its fiducials are observed, and three are needed."
     return ""
 
 
@@ -100,7 +100,7 @@ def _image(frame: OutFrame) -> dict[str, object]:
             mark.point: place.tolist()
             for mark, place in zip(own, frame.pixels(own) + METASHAPE.first_pixel_px, strict=True)
         }
-        for key, own in (("fiducials_px", frame.observed(True)), ("points_px", frame.observed(False)))
+        for key, own in (("fiducials_px", frame.observed_marks(True)), ("points_px", frame.observed_marks(False)))
     }
     return {
         "file": str(frame.scan_file.resolve()) if frame.scan_file else frame.file_name,
@@ -114,8 +114,8 @@ def _image(frame: OutFrame) -> dict[str, object]:
 
 def _calibration(lens: FittedLens, box: Canvas) -> str:
     """Calibration of the exposed frame; cx and cy from its centre. Metashape's p1 is OpenCV's p2."""
-    fx, fy, x0, y0 = lens.named(INTERIOR)
-    k1, k2, p1, p2, k3 = lens.named(BROWN)
+    fx, fy, x0, y0 = lens.coefficients(INTERIOR)
+    k1, k2, p1, p2, k3 = lens.coefficients(BROWN)
     middle = box.x_mm + box.width_px * box.pitch_mm / 2.0, box.y_mm - box.height_px * box.pitch_mm / 2.0
     values = {
         "f": fy,

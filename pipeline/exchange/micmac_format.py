@@ -10,28 +10,9 @@ import numpy as np
 
 from pipeline.adjusting.picture_turn import NOT_TURNED
 from pipeline.errors import InputError
+from pipeline.exchange import incoming, pinhole
 from pipeline.exchange.block import ImageBlock, OutFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
-from pipeline.exchange.incoming import (
-    Y_DOWN_Z_FORWARD,
-    Content,
-    Element,
-    ForeignMark,
-    ImportOptions,
-    Incoming,
-    child_numbers,
-    child_text,
-    fiducial_camera,
-    read_xml,
-    xml_text,
-)
-from pipeline.exchange.pinhole import (
-    BROWN,
-    FittedLens,
-    checked_misfits,
-    frame_corners_mm,
-    sheared_lens,
-)
 from pipeline.opencv_check.opencv_calibration import INTERIOR
 from pipeline.resampling.canvas import Canvas
 from pipeline.results.comparator_file import ComparatorPoint
@@ -81,8 +62,8 @@ def _camera_files(block: ImageBlock, camera: str, options: ExportOptions) -> Wri
     files: dict[str, str | bytes] = {}
     left_out: tuple[str, ...] = ()
     if fiducials:
-        files["Ori-InterneScan/MeasuresCamera.xml"] = xml_text(*_marks("Glob", fiducials))
-        found = {frame.image: frame.observed(fiducials=True) for frame in frames}
+        files["Ori-InterneScan/MeasuresCamera.xml"] = incoming.xml_text(*_marks("Glob", fiducials))
+        found = {frame.image: frame.observed_marks(fiducials=True) for frame in frames}
         few = [frame.image for frame in frames if len(found[frame.image]) < _FEWEST]
         reason = "fiducials are observed, and MicMac's affine fit needs three."
         left_out = tuple(f"{image}: {len(found[image])} {reason}" for image in few)
@@ -92,7 +73,7 @@ def _camera_files(block: ImageBlock, camera: str, options: ExportOptions) -> Wri
             pixels = frame.pixels(marks) + MICMAC.first_pixel_px
             places = {mark.point: pixel for mark, pixel in zip(marks, pixels, strict=True)}
             own = _marks(frame.file_name, places, _sigmas_px(marks, sum(frame.known_pitch_um) / 2000.0))
-            files[f"Ori-InterneScan/MeasuresIm-{frame.file_name}.xml"] = xml_text(*own)
+            files[f"Ori-InterneScan/MeasuresIm-{frame.file_name}.xml"] = incoming.xml_text(*own)
     turned = [frame for frame in frames if frame.turn != NOT_TURNED]
     left_out += tuple(f"{frame.image}: {TURNED}" for frame in turned)
     oriented = [frame for frame in frames if frame.is_oriented and frame not in turned]
@@ -101,10 +82,10 @@ def _camera_files(block: ImageBlock, camera: str, options: ExportOptions) -> Wri
         command = (_resampling(camera, film_box(block, frames[0], options)),) if has_frame else ()
         without = f"{camera}: no image is oriented, so there are marks only: its calibration needs object points."
         return Written(files, notes=(*command, without), left_out=left_out)
-    lens = sheared_lens(block, oriented[0], at_ideal=True)
+    lens = pinhole.sheared_lens(block, oriented[0], at_ideal=True)
     box = camera_box(block, oriented[0], options)
     reech = _REECH if fiducials else ""
-    misfit_px = checked_misfits(block, oriented, lens, box, options, "micmac")
+    misfit_px = pinhole.checked_misfits(block, oriented, lens, box, options, "micmac")
     calibration = f"Ori-Reseau/AutoCal_{file_word(camera)}.xml"
     files[calibration] = _calibration(lens, box)
     for frame in oriented:
@@ -126,7 +107,7 @@ def _camera_files(block: ImageBlock, camera: str, options: ExportOptions) -> Wri
 def film_box(block: ImageBlock, frame: OutFrame, options: ExportOptions) -> Canvas:
     """Canvas for ReSampFid: the exposed frame, at whole multiples of the pitch, never the bounding box of the marks."""
     pitch = options.pitch_um or float(np.sqrt(np.prod(frame.known_pitch_um)))
-    corners = frame_corners_mm(block, frame) / (pitch / 1000.0)
+    corners = pinhole.frame_corners_mm(block, frame) / (pitch / 1000.0)
     left, top = floor(corners[0, 0]), ceil(corners[1, 1])
     width, height = ceil(corners[1, 0]) - left, top - floor(corners[0, 1])
     return Canvas(left * pitch / 1000.0, top * pitch / 1000.0, pitch / 1000.0, width, height)
@@ -151,8 +132,8 @@ def camera_box(block: ImageBlock, frame: OutFrame, options: ExportOptions) -> Ca
 
 def _marks(
     image: str, places: Mapping[str, Array], sigmas_px: Mapping[str, float] | None = None
-) -> tuple[str, list[tuple[str, Content]]]:
-    content: list[tuple[str, Content]] = [("NameIm", image)]
+) -> tuple[str, list[tuple[str, incoming.Content]]]:
+    content: list[tuple[str, incoming.Content]] = [("NameIm", image)]
     for point, place in places.items():
         sigma = {"PrecPointe": sigmas_px[point]} if sigmas_px and point in sigmas_px else {}
         content.append(("OneMesureAF1I", {**sigma, "NamePt": point, "PtIm": place}))
@@ -165,31 +146,31 @@ def _sigmas_px(marks: Sequence[ComparatorPoint], pitch_mm: float) -> dict[str, f
     return {point: float(np.sqrt((sigma**2).mean())) / pitch_mm for point, sigma in known.items()}
 
 
-def _calibration(lens: FittedLens, box: Canvas) -> str:
+def _calibration(lens: pinhole.FittedLens, box: Canvas) -> str:
     """Central perspective with ModPhgrStd, in px of the resampled frame. MicMac's P1 is OpenCV's p2."""
-    fx, fy, x0, y0 = lens.named(INTERIOR)
-    k1, k2, p1, p2, k3 = lens.named(BROWN)
+    fx, fy, x0, y0 = lens.coefficients(INTERIOR)
+    k1, k2, p1, p2, k3 = lens.coefficients(pinhole.BROWN)
     focal = float(fy / box.pitch_mm)
     point = box.pixel_from_camera(np.array([x0, y0])) + MICMAC.first_pixel_px
-    radial: list[tuple[str, Content]] = [("CDist", point)]
+    radial: list[tuple[str, incoming.Content]] = [("CDist", point)]
     radial += [("CoeffDist", float(k / focal ** (2 * i))) for i, k in enumerate((k1, k2, k3), 1)]
     affine = {"b1": float(fx / fy - 1.0), "b2": float(lens.shear)}
-    distortion: Content = {"RadialePart": radial, "P1": float(p2 / focal), "P2": float(p1 / focal), **affine}
-    content: Content = {
+    distortion: incoming.Content = {"RadialePart": radial, "P1": float(p2 / focal), "P2": float(p1 / focal), **affine}
+    content: incoming.Content = {
         **_KNOWN,
         "PP": point,
         "F": focal,
         "SzIm": f"{box.width_px} {box.height_px}",
         "CalibDistortion": {"ModPhgrStd": distortion},
     }
-    return xml_text("ExportAPERO", {"CalibrationInternConique": content})
+    return incoming.xml_text("ExportAPERO", {"CalibrationInternConique": content})
 
 
 def _orientation(frame: OutFrame, calibration: str) -> str:
     assert frame.model is not None
-    rows = (Y_DOWN_Z_FORWARD @ frame.model.rotation).T  # rotation from camera to world
+    rows = (incoming.Y_DOWN_Z_FORWARD @ frame.model.rotation).T  # rotation from camera to world
     matrix = {f"L{i}": row for i, row in enumerate(rows, 1)}
-    content: Content = {
+    content: incoming.Content = {
         "TypeProj": "eProjStenope",
         "ZoneUtileInPixel": "true",
         "FileInterne": calibration,
@@ -197,29 +178,29 @@ def _orientation(frame: OutFrame, calibration: str) -> str:
         "Externe": {**_KNOWN, "Centre": frame.model.station, "ParamRotation": {"CodageMatr": matrix}},
         "ConvOri": _KNOWN,
     }
-    return xml_text("ExportAPERO", {"OrientationConique": content})
+    return incoming.xml_text("ExportAPERO", {"OrientationConique": content})
 
 
 def _measures(block: ImageBlock, frames: Sequence[OutFrame], box: Canvas, reech: str) -> str:
     """The object points' marks in the frames created by ReSampFid, or in a digital camera's images."""
     images = []
     for frame in frames:
-        marks = frame.observed(fiducials=False)
+        marks = frame.observed_marks(fiducials=False)
         pixels = box.pixel_from_camera(frame.camera_mm(marks)) + MICMAC.first_pixel_px
         known = zip(marks, pixels, strict=True)
         places = {mark.point: pixel for mark, pixel in known if mark.point in block.points}
         images.append(_marks(f"{reech}{frame.file_name}", places, _sigmas_px(marks, box.pitch_mm)))
-    return xml_text("SetOfMesureAppuisFlottants", images)
+    return incoming.xml_text("SetOfMesureAppuisFlottants", images)
 
 
 def _ground(block: ImageBlock) -> str:
     assert block.adjustment is not None
-    points: list[tuple[str, Content]] = []
+    points: list[tuple[str, incoming.Content]] = []
     for id, place in block.points.items():
         sigmas = np.array([each.sigma for each in block.adjustment.points[id].axes])
         known = np.where(np.isfinite(sigmas), sigmas, 0.0)
         points.append(("OneAppuisDAF", {"Pt": place, "NamePt": id, "Incertitude": known}))
-    return xml_text("DicoAppuisFlottant", points)
+    return incoming.xml_text("DicoAppuisFlottant", points)
 
 
 def _resampling(camera: str, box: Canvas) -> str:
@@ -231,7 +212,7 @@ def _resampling(camera: str, box: Canvas) -> str:
 
 def _affine_misfit_px(frame: OutFrame, fiducials: Mapping[str, Array], box: Canvas) -> float:
     """Largest difference, px of the frame, at an image's fiducials between the unweighted and the adjusted affinity."""
-    marks = tuple(mark for mark in frame.observed(fiducials=True) if mark.point in fiducials)
+    marks = tuple(mark for mark in frame.observed_marks(fiducials=True) if mark.point in fiducials)
     if len(marks) < _FEWEST:
         return 0.0
     design = np.array([[*mark.xy_mm, 1.0] for mark in marks if mark.xy_mm is not None])
@@ -239,12 +220,12 @@ def _affine_misfit_px(frame: OutFrame, fiducials: Mapping[str, Array], box: Canv
     return float(np.linalg.norm(fitted - frame.camera_mm(marks), axis=1).max()) / box.pitch_mm
 
 
-def import_micmac(paths: Sequence[Path], options: ImportOptions) -> Incoming:
+def import_micmac(paths: Sequence[Path], options: incoming.ImportOptions) -> incoming.Incoming:
     """Read MeasuresIm-*.xml (fiducials), MeasuresCamera.xml (gives a camera file) and sets of marks (object points)."""
-    marks: list[ForeignMark] = []
+    marks: list[incoming.ForeignMark] = []
     cameras = []
     for path in paths:
-        root = read_xml(path)
+        root = incoming.read_xml(path)
         alone = root.tag == "MesureAppuiFlottant1Im"
         images = [root] if alone else root.findall("MesureAppuiFlottant1Im")
         if not images:
@@ -255,22 +236,28 @@ def import_micmac(paths: Sequence[Path], options: ImportOptions) -> Incoming:
                 raise InputError(
                     f"{path}: has no mark <OneMesureAF1I>, so nothing is known of the camera. Name another."
                 )
-            cameras.append(fiducial_camera(path.parent.parent.name or "camera", places))
+            cameras.append(incoming.fiducial_camera(path.parent.parent.name or "camera", places))
             continue
         kind: Literal["fiducial", "target"] = "fiducial" if alone or options.fiducials else "target"
         for image in images:
-            name = image_name(child_text(image, "NameIm", path))
+            name = image_name(incoming.child_text(image, "NameIm", path))
             for point, place, sigma_px in _points(image, path):
                 covariance = sigma_px**2 * np.eye(2) if sigma_px is not None and sigma_px > 0.0 else None
-                marks.append(ForeignMark(name, point, kind, place - MICMAC.first_pixel_px, covariance))
-    return Incoming(tuple(marks), tuple(cameras))
+                marks.append(incoming.ForeignMark(name, point, kind, place - MICMAC.first_pixel_px, covariance))
+    return incoming.Incoming(tuple(marks), tuple(cameras))
 
 
-def _points(image: Element, path: Path) -> Iterator[tuple[str, Array, float | None]]:
+def _points(image: incoming.Element, path: Path) -> Iterator[tuple[str, Array, float | None]]:
     """Name, place and standard deviation (or None) of an image's marks."""
     for mark in image.findall("OneMesureAF1I"):
-        sigma_px = child_numbers(mark, "PrecPointe", 1, path)[0] if mark.find("PrecPointe") is not None else None
-        yield child_text(mark, "NamePt", path), np.array(child_numbers(mark, "PtIm", 2, path)), sigma_px
+        sigma_px = (
+            incoming.child_numbers(mark, "PrecPointe", 1, path)[0] if mark.find("PrecPointe") is not None else None
+        )
+        yield (
+            incoming.child_text(mark, "NamePt", path),
+            np.array(incoming.child_numbers(mark, "PtIm", 2, path)),
+            sigma_px,
+        )
 
 
 MMVII = Convention(
@@ -283,7 +270,7 @@ _FOLDERS = {True: "Fiducials", False: "Targets"}
 
 def write_mmvii(block: ImageBlock, options: ExportOptions) -> Written:
     """Write MMVII-PhgrProj/PointsMeasure/{Fiducials, Targets}/MesIm-IMAGE.xml."""
-    kinds = [(frame, folder, frame.observed(is_f)) for frame in block.frames for is_f, folder in _FOLDERS.items()]
+    kinds = [(frame, folder, frame.observed_marks(is_f)) for frame in block.frames for is_f, folder in _FOLDERS.items()]
     files = {
         f"MMVII-PhgrProj/PointsMeasure/{folder}/MesIm-{frame.file_name}.xml": _mmvii_measures(frame, marks)
         for frame, folder, marks in kinds
@@ -296,35 +283,35 @@ def write_mmvii(block: ImageBlock, options: ExportOptions) -> Written:
 
 
 def _mmvii_measures(frame: OutFrame, marks: tuple[ComparatorPoint, ...]) -> str:
-    measures: list[tuple[str, Content]] = []
+    measures: list[tuple[str, incoming.Content]] = []
     for mark, place in zip(marks, frame.pixels(marks) + MMVII.first_pixel_px, strict=True):
         sigma2 = np.array([1.0, 0.0, 1.0])  # xx, xy, yy in px
         if mark.sigma_mm is not None:
             sx, sy = mark.sigma_mm / (np.array(frame.known_pitch_um) / 1000.0)
             sigma2 = np.array([sx * sx, -mark.rho * sx * sy, sy * sy])  # rows point down, so xy changes its sign
         measures.append(("el", {"Name": f'"{mark.point}"', "Pt": place, "Sigma2": sigma2}))
-    data: Content = {"SetMesIm": {"NameIm": f'"{frame.file_name}"', "Measures": measures}}
-    return xml_text("Root", {"Type": '"MMVII_Serialization"', "Version": '"0.0.0"', "Data": data})
+    data: incoming.Content = {"SetMesIm": {"NameIm": f'"{frame.file_name}"', "Measures": measures}}
+    return incoming.xml_text("Root", {"Type": '"MMVII_Serialization"', "Version": '"0.0.0"', "Data": data})
 
 
-def import_mmvii(paths: Sequence[Path], options: ImportOptions) -> Incoming:
+def import_mmvii(paths: Sequence[Path], options: incoming.ImportOptions) -> incoming.Incoming:
     """Read MesIm-*.xml: marks with their covariances. Those in a folder Fiducials are fiducials."""
     marks = []
     for path in paths:
         is_fiducial = options.fiducials or path.resolve().parent.name == _FOLDERS[True]
-        measures = read_xml(path).find("Data/SetMesIm")
+        measures = incoming.read_xml(path).find("Data/SetMesIm")
         if measures is None:
             raise InputError(f"{path}: has no <SetMesIm>. Files MesIm-*.xml are read.")
-        image = image_name(_unquoted(child_text(measures, "NameIm", path)))
+        image = image_name(_unquote(incoming.child_text(measures, "NameIm", path)))
         for element in measures.iterfind("Measures/el"):
-            place = np.array(child_numbers(element, "Pt", 2, path)) - MMVII.first_pixel_px
-            xx, xy, yy = child_numbers(element, "Sigma2", 3, path)
+            place = np.array(incoming.child_numbers(element, "Pt", 2, path)) - MMVII.first_pixel_px
+            xx, xy, yy = incoming.child_numbers(element, "Sigma2", 3, path)
             known = xx > 0.0 and yy > 0.0 and xx * yy > xy * xy
             covariance = np.array([[xx, xy], [xy, yy]]) if known else None
-            name = _unquoted(child_text(element, "Name", path))
-            marks.append(ForeignMark(image, name, "fiducial" if is_fiducial else "target", place, covariance))
-    return Incoming(tuple(marks))
+            name = _unquote(incoming.child_text(element, "Name", path))
+            marks.append(incoming.ForeignMark(image, name, "fiducial" if is_fiducial else "target", place, covariance))
+    return incoming.Incoming(tuple(marks))
 
 
-def _unquoted(text: str) -> str:
+def _unquote(text: str) -> str:
     return text[1:-1] if len(text) > 1 and text[0] == text[-1] == '"' else text

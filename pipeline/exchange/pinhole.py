@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from adjust.errors import AdjustmentError
@@ -22,18 +21,19 @@ from adjust.functional_model.lens_conversion import convert_lens, frame_grid_mm
 from adjust.functional_model.projection import STRAIGHT
 from measure.errors import MeasurementError
 from pipeline.errors import InputError, missing_extra
+from pipeline.exchange import incoming
 from pipeline.exchange.block import ImageBlock, OutFrame, WholeFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
-from pipeline.exchange.incoming import (
-    Y_DOWN_Z_FORWARD,
-    ImportOptions,
-    Incoming,
-    foreign_pose,
-    opencv_camera,
-)
 from pipeline.files.camera_file import CameraFile
-from pipeline.files.opencv_file import FISHEYE_MODEL, read_matrix, read_pixel_camera
-from pipeline.opencv_check.opencv_calibration import FISHEYE, INTERIOR, NAMES, fixed, model_names, opencv_values
+from pipeline.files.opencv_file import FISHEYE_MODEL, read_matrix, read_pixel_camera, yaml_text
+from pipeline.opencv_check.opencv_calibration import (
+    FISHEYE,
+    INTERIOR,
+    NAMES,
+    fixed_distortion,
+    model_names,
+    opencv_values,
+)
 from pipeline.resampling.canvas import Canvas, outline_canvas
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.files import image_name
@@ -84,7 +84,7 @@ class FittedLens:
     lens: Lens
     largest_mm: float
 
-    def named(self, names: Sequence[str]) -> Array:
+    def coefficients(self, names: Sequence[str]) -> Array:
         """OpenCV's parameters by their names, in mm with y up; 0 for those of the other model."""
         known = dict(zip(model_names(self.lens.distortion.family), opencv_values(self.lens)[0], strict=True))
         return np.array([known.get(name, 0.0) for name in names])
@@ -111,7 +111,7 @@ def nearest_lens(
     """
     lens = frame.lens
     if options.with_lens or lens.distortion.family == "none":
-        return FittedLens(_undistorted(lens), 0.0)
+        return FittedLens(_without_distortion(lens), 0.0)
     if lens.distortion.family == FISHEYE:
         farthest_mm = float(np.abs(frame_corners_mm(block, frame)[:, 1] - lens.interior[2]).max())
         return FittedLens(lens, abs(float(lens.parameters[-1])) * farthest_mm)
@@ -138,7 +138,7 @@ def sheared_lens(block: ImageBlock, frame: OutFrame, at_ideal: bool) -> FittedLe
     lens = frame.lens
     family = lens.distortion.family
     if family == "none":
-        return FittedLens(_undistorted(lens), 0.0)
+        return FittedLens(_without_distortion(lens), 0.0)
     if _has_only(lens, BROWN if at_ideal else (*BROWN, *_AFFINE)):
         return FittedLens(lens, 0.0)
     if family in _ONE_SCALE or not at_ideal:
@@ -175,7 +175,7 @@ def frame_corners_mm(block: ImageBlock, frame: OutFrame) -> Array:
     return np.array([observed.min(axis=0), observed.max(axis=0)])
 
 
-def _undistorted(lens: Lens) -> Lens:
+def _without_distortion(lens: Lens) -> Lens:
     return Lens(Distortion("opencv"), lens.interior, np.zeros(len(parameter_names("opencv"))))
 
 
@@ -192,12 +192,12 @@ def _fit_opencv(block: ImageBlock, frame: OutFrame, names: Sequence[str]) -> Fit
     family = lens.distortion.family
     estimated = [name for name in names if name not in _AFFINE] if family in _ONE_SCALE else [*names, "b1"]
     own = zip(parameter_names(family), lens.parameters.tolist(), strict=True)
-    into = fixed("opencv", {name: value for name, value in own if name in estimated} if family == "opencv" else {})
+    into = fixed_distortion({name: value for name, value in own if name in estimated} if family == "opencv" else {})
     corners_mm = frame_corners_mm(block, frame)
     try:
         found = convert_lens(lens, into, corners_mm, estimated)
     except AdjustmentError:  # treat it as a model that does not fit
-        return FittedLens(_undistorted(lens), np.inf)
+        return FittedLens(_without_distortion(lens), np.inf)
     return FittedLens(found.lens, found.largest_mm)
 
 
@@ -243,7 +243,7 @@ class PinholeFrame:
 
     def interior_px(self, convention: Convention) -> Array:
         """fx, fy, cx, cy (4,) in px."""
-        interior = self.lens.named(INTERIOR)
+        interior = self.lens.coefficients(INTERIOR)
         point = self.canvas.pixel_from_camera(interior[2:]) + convention.first_pixel_px
         return np.concatenate([interior[:2] / self.canvas.pitch_mm, point])
 
@@ -251,7 +251,7 @@ class PinholeFrame:
     def rotation(self) -> Array:
         """Rotation (3, 3) from the object's to the camera's axes."""
         assert self.frame.model is not None
-        return np.asarray(Y_DOWN_Z_FORWARD @ self.frame.model.rotation)
+        return np.asarray(incoming.Y_DOWN_Z_FORWARD @ self.frame.model.rotation)
 
     @property
     def station(self) -> Array:
@@ -288,7 +288,7 @@ def pinhole_frames(
     block.needs_orientation(format)
     lenses: dict[str, FittedLens] = {}
     frames, left_out = [], list(block.unoriented_note())
-    for frame in block.whole(block.oriented()):
+    for frame in block.whole(block.oriented_frames()):
         if frame.camera not in lenses:
             lenses[frame.camera] = nearest_lens(block, frame, models, options)
         try:
@@ -324,7 +324,7 @@ def sight_misfit_mm(block: ImageBlock, frame: OutFrame) -> float:
     """Largest shift of an image's points by refraction and earth curvature, which other programs do not model."""
     model = frame.model
     assert model is not None
-    points = [block.points[mark.point] for mark in frame.observed(fiducials=False) if mark.point in block.points]
+    points = [block.points[mark.point] for mark in frame.observed_marks(fiducials=False) if mark.point in block.points]
     if model.line_of_sight.is_straight or not points:
         return 0.0
     bent, straight = (
@@ -378,7 +378,7 @@ def write_asp(block: ImageBlock, options: ExportOptions) -> Written:
 
 def _tsai(frame: PinholeFrame) -> str:
     pitch = frame.canvas.pitch_mm
-    model, terms = "TSAI", dict(zip(BROWN, frame.lens.named(BROWN).tolist(), strict=True))
+    model, terms = "TSAI", dict(zip(BROWN, frame.lens.coefficients(BROWN).tolist(), strict=True))
     if frame.lens.fisheye:
         model, terms = "FISHEYE", dict(zip(("k1", "k2", "k3", "k4"), frame.lens.fisheye, strict=True))
     interior = zip(("fu", "fv", "cu", "cv"), (frame.interior_px(ASP) * pitch).tolist(), strict=True)
@@ -408,28 +408,27 @@ def write_opencv(block: ImageBlock, options: ExportOptions) -> Written:
 def _yaml(frame: PinholeFrame, lens_reach: str | None) -> str:
     """YAML text of one image. lens_reach: comment on the radius up to which the lens is known."""
     fx, fy, cx, cy = frame.interior_px(OPENCV)
-    distortion = frame.lens.named(NAMES[4:])
+    distortion = frame.lens.coefficients(NAMES[4:])
     used = np.flatnonzero(distortion)
     count = next(size for size in (5, 8, 12, 14) if size > (used.max() if used.size else 0))
-    storage = cv2.FileStorage("", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML)
-    storage.write("image", frame.picture)
-    storage.write("camera", frame.frame.camera)
-    storage.write("image_width", frame.canvas.width_px)
-    storage.write("image_height", frame.canvas.height_px)
-    storage.write("camera_matrix", np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
-    if lens_reach:
-        storage.writeComment(lens_reach)
-    if frame.lens.fisheye:
-        storage.write("distortion_model", FISHEYE_MODEL)
-        storage.write("distortion_coefficients", np.array([frame.lens.fisheye]))
-    else:
-        storage.write("distortion_coefficients", distortion[:count].reshape(1, -1))
-    storage.write("R", frame.rotation)
-    storage.write("t", frame.translation.reshape(3, 1))
-    return str(storage.releaseAndGetString())
+    coefficients = np.array([frame.lens.fisheye or distortion[:count]])
+    return yaml_text(
+        [
+            ("image", frame.picture),
+            ("camera", frame.frame.camera),
+            ("image_width", frame.canvas.width_px),
+            ("image_height", frame.canvas.height_px),
+            ("camera_matrix", np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])),
+            *([("", lens_reach)] if lens_reach else []),
+            *([("distortion_model", FISHEYE_MODEL)] if frame.lens.fisheye else []),
+            ("distortion_coefficients", coefficients),
+            ("R", frame.rotation),
+            ("t", frame.translation.reshape(3, 1)),
+        ]
+    )
 
 
-def import_opencv(paths: Sequence[Path], options: ImportOptions) -> Incoming:
+def import_opencv(paths: Sequence[Path], options: incoming.ImportOptions) -> incoming.Incoming:
     """Read files of cv2.FileStorage: matrix, distortion and size as camera files; R and t, if given, as orientations.
 
     Cameras of one name that differ, as those of rectified frames of different sizes do, get their pictures' names too.
@@ -440,7 +439,7 @@ def import_opencv(paths: Sequence[Path], options: ImportOptions) -> Incoming:
         found, storage = read_pixel_camera(path)
         name = storage.getNode("camera").string() or path.stem
         picture = image_name(storage.getNode("image").string() or path.stem)
-        camera = opencv_camera(
+        camera = incoming.opencv_camera(
             path, name, found.interior_px, found.distortion, found.size_px, options, OPENCV, found.family
         )
         if picture in pictures:
@@ -457,8 +456,8 @@ def import_opencv(paths: Sequence[Path], options: ImportOptions) -> Incoming:
     cameras = {
         picture: replace(one, name=f"{one.name} {picture}") if one.name in differing else one for picture, one in read
     }
-    poses = (foreign_pose(picture, *turn, cameras[picture].name) for picture, turn in turns.items())
-    return Incoming(cameras=tuple(cameras.values()), poses=tuple(poses))
+    poses = (incoming.foreign_pose(picture, *turn, cameras[picture].name) for picture, turn in turns.items())
+    return incoming.Incoming(cameras=tuple(cameras.values()), poses=tuple(poses))
 
 
 def write_colmap(block: ImageBlock, options: ExportOptions) -> Written:
@@ -487,7 +486,7 @@ def _reconstruction(pycolmap: Any, block: ImageBlock, frames: list[PinholeFrame]
     """
     made, tracks = pycolmap.Reconstruction(), defaultdict(list)
     for number, frame in enumerate(frames, 1):
-        model, terms, rest = "OPENCV", frame.lens.named(_OPENCV[len(INTERIOR) :]), frame.lens.named(_FULL)
+        model, terms, rest = "OPENCV", frame.lens.coefficients(_OPENCV[len(INTERIOR) :]), frame.lens.coefficients(_FULL)
         if rest.any():
             model, terms = "FULL_OPENCV", np.concatenate([terms, rest])
         if frame.lens.fisheye:
@@ -497,7 +496,7 @@ def _reconstruction(pycolmap: Any, block: ImageBlock, frames: list[PinholeFrame]
         made.add_camera_with_trivial_rig(
             pycolmap.Camera(camera_id=number, model=model, width=width, height=height, params=params)
         )
-        marks = tuple(mark for mark in frame.frame.observed(fiducials=False) if mark.point in block.points)
+        marks = tuple(mark for mark in frame.frame.observed_marks(fiducials=False) if mark.point in block.points)
         places = frame.pixels(marks) + COLMAP.first_pixel_px
         image = pycolmap.Image(frame.picture, places, number, number)
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(frame.rotation), frame.translation)
@@ -512,7 +511,7 @@ def _reconstruction(pycolmap: Any, block: ImageBlock, frames: list[PinholeFrame]
     return made
 
 
-def import_colmap(paths: Sequence[Path], options: ImportOptions) -> Incoming:
+def import_colmap(paths: Sequence[Path], options: incoming.ImportOptions) -> incoming.Incoming:
     """Read folders of reconstructions (.bin or .txt): orientations as approximations, and cameras of the models that
     OpenCV has."""
     pycolmap = import_pycolmap("the format colmap")
@@ -535,17 +534,17 @@ def import_colmap(paths: Sequence[Path], options: ImportOptions) -> Incoming:
             size = (camera.width, camera.height)
             family = "opencv_fisheye" if camera.model_name == _FISHEYE else "opencv"
             name = f"camera{number}"
-            cameras.append(opencv_camera(folder, name, interior, lens, size, options, COLMAP, family))
+            cameras.append(incoming.opencv_camera(folder, name, interior, lens, size, options, COLMAP, family))
         for image in made.images.values():
             if image.has_pose:
                 pose = image.cam_from_world()
                 camera_name = f"camera{image.camera_id}"
                 poses.append(
-                    foreign_pose(image_name(image.name), pose.rotation.matrix(), pose.translation, camera_name)
+                    incoming.foreign_pose(image_name(image.name), pose.rotation.matrix(), pose.translation, camera_name)
                 )
     poses.sort(key=lambda pose: pose.image)
     notes.append("The exterior orientations are approximations, in the coordinates of that reconstruction.")
-    return Incoming(cameras=tuple(cameras), poses=tuple(poses), notes=tuple(notes), left_out=tuple(left_out))
+    return incoming.Incoming(cameras=tuple(cameras), poses=tuple(poses), notes=tuple(notes), left_out=tuple(left_out))
 
 
 def _parameters(camera: Any) -> tuple[list[float], dict[str, float]] | None:

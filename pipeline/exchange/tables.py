@@ -61,7 +61,7 @@ def tables(block: ImageBlock) -> Mapping[str, Table]:
         rows |= {
             "images": (
                 {"image": frame.image, "camera": frame.camera, **_values_and_sigmas(known.exterior.elements)}
-                for frame in block.oriented()
+                for frame in block.oriented_frames()
                 for known in [adjustment.images[frame.image]]
             ),
             "transformations": _transformations(adjustment, block),
@@ -172,12 +172,12 @@ def write_bingo(block: ImageBlock, options: ExportOptions) -> Written:
     """Write bingo.txt with the corrected coordinates of every point of every adjusted image."""
     block.needs_orientation("bingo")
     _check_words(frame.image for frame in block.frames)
-    _check_words(mark.point for frame in block.frames for mark in frame.observed(fiducials=False))
+    _check_words(mark.point for frame in block.frames for mark in frame.observed_marks(fiducials=False))
     unknown = (scan.image for scan in block.frames if scan.model is None)
     left_out = [f"{image}: it has no part in the adjustment, so its film is not known." for image in unknown]
     texts, interior = [], dict[str, str]()
     for frame in block.whole(scan for scan in block.frames if scan.model is not None):
-        lens, camera, marks = frame.lens, _word(frame.camera), frame.observed(fiducials=False)
+        lens, camera, marks = frame.lens, _word(frame.camera), frame.observed_marks(fiducials=False)
         # From the centre of the fiducial frame; of a digital camera, which has none, from the principal point.
         origin = np.zeros(2) if block.camera_file(frame.camera).fiducials else lens.interior[1:]
         x, y = lens.interior[1:] - origin

@@ -249,7 +249,7 @@ def _fiducials(
         if other is not None:
             raise entry.error("xy_mm", f"fiducial {other.id!r} has the same place. Every mark has one of its own.")
         drawing = drawings.get(one.mark or "")
-        drawn = None if drawing is None else _placed(*drawing, one.xy_mm)
+        drawn = None if drawing is None else _place_mark(*drawing, one.xy_mm)
         fiducials[one.id] = GivenFiducial(
             one.id, one.xy_mm, one.sigma_mm, drawn, one.mark == NO_MARK and drawn is None, one.template_origin_mm
         )
@@ -281,7 +281,7 @@ def fiducial_distances(
     return tuple(FiducialDistance(one.start, one.end, one.mm, one.sigma_mm) for one in given)
 
 
-def _placed(
+def _place_mark(
     mark: shapes.Mark | shapes.LearnedMark, radial: bool, xy_mm: shapes.Point
 ) -> shapes.Mark | shapes.LearnedMark:
     """Mark at its place in the frame.

@@ -260,12 +260,12 @@ def append_decisions(path: Path, decisions: Iterable[Decision]) -> None:
         except (LineError, ValueError) as error:
             about = f"{decision.image}{f', {decision.point}' if decision.point else ''}"
             raise InputError(f"the decision about {about}{error}. Nothing was written.") from None
-    with _locked(path.parent):
+    with _lock_folder(path.parent):
         write_atomically(path.resolve(), _whole_lines(path) + "".join(lines).encode())
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def _lock_folder(folder: Path) -> Iterator[None]:
     """Lock a folder against other processes that append; no lock where the file system has none."""
     if fcntl is None:
         yield

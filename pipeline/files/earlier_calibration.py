@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from adjust.functional_model.families import parameter_names
-from adjust.functional_model.lens import Distortion, Prior
+from adjust.functional_model.lens import INTERIOR_NAMES, Distortion, Prior
 from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.observations import Calibration
 from adjust.problem.parameter import Parameter
@@ -17,8 +17,6 @@ from pipeline.results.adjustment_file import ParameterCovariance, covariance_pat
 from pipeline.results.adjustment_record import CameraRecord, DistortionRecord
 from pipeline.text.toml_tables import Table
 from pipeline.types import Array
-
-INTERIOR = ("c", "x0", "y0")
 
 _ALIKE = 1e-6  # relative difference of numbers that differ only by rounding
 _TOGETHER = "Take both files as one adjustment wrote them."
@@ -42,7 +40,7 @@ class EarlierCalibration:
     covariance: Array
     held: Mapping[Parameter, float]
 
-    def applied(self, camera: Camera) -> tuple[Camera, Calibration]:
+    def apply_to(self, camera: Camera) -> tuple[Camera, Calibration]:
         """The camera, with priors removed where the calibration replaces them, and the calibration for the network."""
         here = tuple(each._replace(owner=camera.name) for each in self.parameters)
         given = {(each.id, each.quantity): value for each, value in zip(here, self.values.tolist(), strict=True)}
@@ -166,7 +164,9 @@ def _check_family(sigma: Table, path: Path, earlier: DistortionRecord, distortio
 def _calibration(
     path: Path, covariance: ParameterCovariance, there: str, camera: Camera, fiducials: bool
 ) -> EarlierCalibration:
-    parameters = [Parameter.interior(there, name) for name in (*INTERIOR, *parameter_names(camera.distortion.family))]
+    parameters = [
+        Parameter.interior(there, name) for name in (*INTERIOR_NAMES, *parameter_names(camera.distortion.family))
+    ]
     if fiducials:
         parameters += [Parameter.fiducial(there, id, axis) for id in camera.fiducials for axis in "xy"]
     value = dict(zip(covariance.parameters, covariance.values.tolist(), strict=True))

@@ -215,7 +215,7 @@ class LearnedPicture:
     steady: models.FilePath | None = None
     shares: Mapping[str, models.Positive] = dataclasses.field(default_factory=dict)
 
-    def applied(self, template: MarkTemplate, table: Table) -> MarkTemplate:
+    def apply_to(self, template: MarkTemplate, table: Table) -> MarkTemplate:
         """Template with its learned properties."""
         pictures = {key: _image(table, key) / _FULL if key in table else None for key in ("steadiness", "steady")}
         for key, values in pictures.items():
@@ -272,7 +272,7 @@ class TemplateTable(PaintedTable):
             turn_deg=self.turn_deg,
             detail_mm=self.detail_mm,
         )
-        return self.learned.applied(template, table.table("learned")) if self.learned else template
+        return self.learned.apply_to(template, table.table("learned")) if self.learned else template
 
 
 @models.table_model

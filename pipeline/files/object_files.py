@@ -156,7 +156,7 @@ def read_images(path: FilePath, antenna: tuple[float, float, float] = (0.0, 0.0,
             raise InputError(f"{path}, line {row.line}: image {name!r} is given twice. Remove one of the lines.")
         exterior[name] = _exterior(row, antenna)
         camera[name], scanner[name], part_of[name] = row.text("camera"), row.text("scanner"), row.text("part_of")
-        if any(cut := _cut(row)):
+        if any(cut := _page_and_window(row)):
             cuts[name] = cut
         text = row.text("turned_deg")
         if text not in ("", "0", "90", "180", "270"):
@@ -170,7 +170,7 @@ def read_images(path: FilePath, antenna: tuple[float, float, float] = (0.0, 0.0,
     return GivenImages(exterior, camera, scanner, asks_writing, turned_deg, part_of, cuts)
 
 
-def _cut(row: Row) -> tuple[int | None, Window | None]:
+def _page_and_window(row: Row) -> tuple[int | None, Window | None]:
     """Page and window of the scan's file, None where they are not given."""
     page, window, numbers = row.text("page"), row.text("window"), row.text("window").split()
     if page and (not page.isdecimal() or int(page) < 1):

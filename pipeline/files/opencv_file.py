@@ -1,6 +1,6 @@
 """Cameras in files of cv2.FileStorage, in pixels; among them the lens of the camera that photographed the film."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +14,7 @@ from adjust.functional_model.lens import Distortion, Lens
 from measure.scans.scan import Scan
 from pipeline.errors import InputError
 from pipeline.results.comparator_file import comparator_from_pixel, pixel_from_comparator
+from pipeline.results.image_unit import pixel_intrinsics
 from pipeline.text.files import read_bytes
 from pipeline.types import Array
 
@@ -62,6 +63,17 @@ def read_pixel_camera(path: Path) -> tuple[PixelCamera, Any]:
         raise InputError(
             f"{path}: is no YAML, XML or JSON file of OpenCV (cv2.FileStorage) with a camera in it. Name one."
         ) from None
+
+
+def yaml_text(values: Iterable[tuple[str, Any]]) -> str:
+    """YAML text of cv2.FileStorage; an empty name marks a comment."""
+    storage = cv2.FileStorage("", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML)
+    for name, value in values:
+        if name:
+            storage.write(name, value)
+        else:
+            storage.writeComment(value)
+    return str(storage.releaseAndGetString())
 
 
 def read_matrix(path: Path, node: Any) -> Array:
@@ -190,18 +202,14 @@ def read_lens(path: Path, pitch_um: float) -> CalibratedLens:
     if camera.size_px is None:
         raise InputError(f"{path}: does not say the picture's size. Give image_width and image_height in px.")
     (fx, fy, cx, cy), pitch_mm = camera.interior_px, pitch_um / 1000.0
-    names = parameter_names(camera.family)
     given = {"b1": fx / fy - 1.0, **camera.distortion}
     interior = np.array([fy, cx, -cy]) * pitch_mm
-    parameters = np.array([given.get(name, 0.0) for name in names])
+    parameters = np.array([given.get(name, 0.0) for name in parameter_names(camera.family)])
     covariance = np.empty((0, 0))
     if camera.covariance is not None:
-        by_px = np.zeros((len(interior) + len(names), len(camera.covariance)))
-        by_px[0, 1] = by_px[1, 2] = pitch_mm
-        by_px[2, 3] = -pitch_mm
-        count = len(camera.covariance) - 4
-        by_px[3 : 3 + count, 4:] = np.eye(count)
-        by_px[3 + names.index("b1"), :2] = 1.0 / fy, -fx / fy**2
+        known = Lens(Distortion(camera.family), interior, parameters)
+        _, by_mm = pixel_intrinsics(dict(zip(known.quantities, known.values.tolist(), strict=True)), pitch_mm)
+        by_px = np.linalg.inv(by_mm)[:, : len(camera.covariance)]
         covariance = by_px @ camera.covariance @ by_px.T
     lens = Lens(Distortion(camera.family), interior, parameters, covariance)
     width, height = (round(side) for side in camera.size_px)

@@ -179,8 +179,8 @@ class Project:
     @property
     def results(self) -> tuple[Path, ...]:
         """Files that the program may write; only its own earlier results may exist there."""
-        stores = (self.measurement_path, self.thumbnails_path)
-        measured = (self.comparator, *stores, self.frames_path) if self.scans else ()
+        databases = (self.measurement_path, self.thumbnails_path)
+        measured = (self.comparator, *databases, self.frames_path) if self.scans else ()
         adjusted = (self.adjustment_path, covariance_path(self.adjustment_path), self.check_path, self.choice_path)
         return (*measured, *adjusted, self.report_path)
 

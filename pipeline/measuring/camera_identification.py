@@ -147,8 +147,8 @@ class Trial:
     likeness : mean correlation of the found marks with the drawing.
     snr : median of contrast over noise.
     score : 0 to 1, see `measure.fiducials.camera_recognition.likeness`.
-    chance : score of the same marks in wrong places, that is, of the stretched layout; None where the comparison is not
-        needed.
+    score_elsewhere : score of the same marks in wrong places, that is, of the stretched layout; None where no
+        comparison is needed.
     residual_sigmas, residual_mm : residuals of an affine transformation per axis, in standard deviations of marks and
         given places, and in mm; None without redundancy.
     expected : expected number of false alarms in such a scan: constellations that correlate as well at reduced size;
@@ -162,7 +162,7 @@ class Trial:
     likeness: float
     snr: float
     score: float
-    chance: float | None
+    score_elsewhere: float | None
     residual_sigmas: float | None
     residual_mm: float | None
     reason: str
@@ -172,7 +172,7 @@ class Trial:
 
     @property
     def stands_out(self) -> bool:
-        return self.score > 0.0 and (self.chance is None or self.score >= _OUTSTANDING * self.chance)
+        return self.score > 0.0 and (self.score_elsewhere is None or self.score >= _OUTSTANDING * self.score_elsewhere)
 
 
 @dataclass(frozen=True)
@@ -214,8 +214,8 @@ class Identification:
             )
         first = self.best[0]
         by_chance = f"{first.expected:.1g} false alarms expected in such a scan"
-        if first.chance is not None:
-            by_chance = f"the same marks in wrong places score {first.chance:.2f}"
+        if first.score_elsewhere is not None:
+            by_chance = f"the same marks in wrong places score {first.score_elsewhere:.2f}"
         text = (
             f"{self.scan.name}: {' or '.join(first.cameras)}, score {first.score:.2f}: {first.found} of {first.drawn} "
             f"marks, likeness {first.likeness:.2f}, signal-to-noise {first.snr:.1f}; {by_chance}."
@@ -291,8 +291,8 @@ def print_identification(identification: Identification, console: Console) -> No
             words.append(f"affine residual {trial.residual_mm:.3f} mm ({trial.residual_sigmas:.0f} sigma)")
         if math.isfinite(trial.expected):
             words.append(f"expected false alarms {trial.expected:.1g}")
-        if trial.chance is not None:
-            words.append(f"in wrong places {trial.chance:.2f}")
+        if trial.score_elsewhere is not None:
+            words.append(f"in wrong places {trial.score_elsewhere:.2f}")
         figures = f"{', '.join(words)}; {trial.seconds:.0f} s"
         console.print(", ".join(trial.cameras), style="bold", highlight=False)
         console.print(Padding(figures, (0, 0, 0, 4)), highlight=False)

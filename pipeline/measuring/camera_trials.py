@@ -102,15 +102,17 @@ class LayoutSearch:
         options = FiducialOptions(pitch_is_right=True)
         ((given,), *_) = pitch_hypotheses(picture, bold, (times * pitch_um[0], times * pitch_um[1]), options)
         hypotheses = [longer(given, each) for each in stretches] or [given]
-        return self._tried(_some(layout), bold, picture, hypotheses, before=1 if stretches else 0)
+        return self._try_layout(_some(layout), bold, picture, hypotheses, before=1 if stretches else 0)
 
     def try_any_pitch(self, layout: FiducialLayout) -> Tried:
         """Search without a pitch: the frame is assumed to fill the scan, and the pixels to be square."""
         bold = _boldest(layout)
         picture = self._coarse_solid if all(is_solid(mark) for mark in bold.marks) else self._coarse
-        return self._tried(_some(layout), bold, picture, pitch_hypotheses(picture, bold, None, FiducialOptions())[0])
+        return self._try_layout(
+            _some(layout), bold, picture, pitch_hypotheses(picture, bold, None, FiducialOptions())[0]
+        )
 
-    def refined(self, coarse: Tried) -> Tried:
+    def refine(self, coarse: Tried) -> Tried:
         """Repeat the search in a larger image, at the pitch of the best placement."""
         if not coarse.answer.placements:
             return coarse
@@ -118,18 +120,18 @@ class LayoutSearch:
         px_per_mm = linear_scale(coarse.answer.placements[0].pixel_from_camera)
         pitch_mm = coarse.picture.width_px / picture.width_px / px_per_mm
         hypothesis = PitchHypothesis((pitch_mm, pitch_mm), _PITCH_TOLERANCE, (pitch_mm, pitch_mm))
-        return self._tried(coarse.layout, coarse.bold, picture, [hypothesis], len(coarse.hypotheses))
+        return self._try_layout(coarse.layout, coarse.bold, picture, [hypothesis], len(coarse.hypotheses))
 
-    def stretched(self, tried: Tried) -> Tried:
+    def stretch(self, tried: Tried) -> Tried:
         """Repeat the search for the stretched layout, whose marks are in wrong places."""
-        layout, bold = _stretched(tried.layout), _stretched(tried.bold)
-        return self._tried(layout, bold, tried.picture, tried.hypotheses, tried.before)
+        layout, bold = _stretched_layout(tried.layout), _stretched_layout(tried.bold)
+        return self._try_layout(layout, bold, tried.picture, tried.hypotheses, tried.before)
 
     def recognise(self, tried: Tried) -> Frame | None:
         """Measure the marks of a layout at its best placement."""
         return recognise_frame(self._scan, tried.layout, tried.answer, self._scan.width_px / tried.picture.width_px)
 
-    def _tried(
+    def _try_layout(
         self, layout: FiducialLayout, bold: FiducialLayout, picture: Scan, hypotheses: Hypotheses, before: int = 0
     ) -> Tried:
         for known in self._known:
@@ -162,7 +164,7 @@ def _some(layout: FiducialLayout) -> FiducialLayout:
     return replace(layout, marks=layout.marks[:: 1 if len(layout.marks) <= _ENOUGH else 2])
 
 
-def _stretched(layout: FiducialLayout) -> FiducialLayout:
+def _stretched_layout(layout: FiducialLayout) -> FiducialLayout:
     x, y = _STRETCH
     marks = tuple(replace(mark, xy_mm=(x * mark.xy_mm[0], y * mark.xy_mm[1])) for mark in layout.marks)
     return replace(layout, marks=marks)
@@ -296,7 +298,7 @@ def _any_pitch_tries(search: LayoutSearch, layouts: Mapping[Names, FiducialLayou
     """Tries without a pitch: each layout determines its own, and the best ones are refined at it."""
     tries = _each(layouts, search.try_any_pitch, count)
     least = sorted({each.answer.expected for each in tries.values()})[:_FEW]
-    best = {names: search.refined(each) for names, each in tries.items() if each.answer.expected in least}
+    best = {names: search.refine(each) for names, each in tries.items() if each.answer.expected in least}
     return tries | best
 
 
@@ -348,12 +350,12 @@ def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Tri
         frame, reason = None, f"too coarse: the finest detail of its marks would be {width_px:.2f} px wide there"
     fits = list(frame.inlier_fits.values()) if frame else []
     residual = _residual(frame, each.layout) if frame else None
-    score, chance = likeness(frame) if frame else 0.0, None
+    score, score_elsewhere = likeness(frame) if frame else 0.0, None
     if score > close and expected > MAX_FALSE_CAMERAS:
-        chance, wrong = 0.0, search.stretched(each)
+        score_elsewhere, wrong = 0.0, search.stretch(each)
         # Where the stretched layout correlates much less, the marks themselves must be present.
         if wrong.answer.expected <= _ODDS * expected and (elsewhere := search.recognise(wrong)):
-            chance = likeness(elsewhere)
+            score_elsewhere = likeness(elsewhere)
     return Trial(
         cameras=names,
         found=len(fits),
@@ -361,7 +363,7 @@ def _trial(search: LayoutSearch, names: Names, each: Tried, close: float) -> Tri
         likeness=float(np.mean([fit.likeness for fit in fits])) if fits else 0.0,
         snr=float(np.median([fit.snr for fit in fits])) if fits else 0.0,
         score=score,
-        chance=chance,
+        score_elsewhere=score_elsewhere,
         residual_sigmas=None if residual is None else residual[0],
         residual_mm=None if residual is None else residual[1],
         reason="" if frame else reason,

@@ -284,12 +284,12 @@ def _sheet_image(scan: MeasuredScan, row: Mapping[str, int]) -> SheetImage:
 
 
 def _tested_mark(
-    mark: MarkMeasurement, off_px: float, chance: float, others: int, is_beyond: bool, misplaced_px: float
+    mark: MarkMeasurement, off_px: float, p_value: float, others: int, is_beyond: bool, misplaced_px: float
 ) -> MarkMeasurement:
     """Set the status of a mark by its distance from its place and p-value, of all images; others: that show the point;
     is_beyond: farther off than the point can lie off its sheet; misplaced_px: as far off in all images, or 0."""
     # Without another image, the mark and the point on the sheet may be at fault; with few others, any of them.
-    if chance > SHEET_POINT_OFF_PLACE:
+    if p_value > SHEET_POINT_OFF_PLACE:
         where = (
             f"another mark, or the board is damaged: {misplaced_px:.2f} px from the point's place on it in all pictures"
         )
@@ -297,10 +297,10 @@ def _tested_mark(
         return rejected if misplaced_px else mark
     witnesses = "the sheet's other points" + (" and other pictures" if others else "")
     how = f"it lies {off_px:.2f} px from where {witnesses} put it"
-    if (others >= _WITNESSES or is_beyond) and chance < SHEET_POINT_ELSEWHERE:
+    if (others >= _WITNESSES or is_beyond) and p_value < SHEET_POINT_ELSEWHERE:
         return replace(
             mark, status=Status.REJECTED, reason=Reason(f"another mark, or one disturbed: {how}", Code.OFF_PLACE)
         )
     alone = "" if others else ", and no other picture tells whether it does so on the sheet"
-    reason = Reason(f"{how}{alone}; p = {chance:.1g}", Code.OFF_PLACE)
+    reason = Reason(f"{how}{alone}; p = {p_value:.1g}", Code.OFF_PLACE)
     return replace(mark, status=Status.WEAK, reason=Reason.combine((mark.reason, reason)))

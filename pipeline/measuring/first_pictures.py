@@ -45,10 +45,14 @@ def first_pictures(camera: CameraFile, tasks: Sequence[ScanTask], workers: Execu
     Returns the camera with the templates, and with the scan they come from. Raises InputError or MeasurementError where
     the places of the marks cannot be determined.
     """
-    return _clicked(camera, camera.clicks, tasks) if camera.clicks else _learn_recurring_marks(camera, tasks, workers)
+    return (
+        _learn_clicked_marks(camera, camera.clicks, tasks)
+        if camera.clicks
+        else _learn_recurring_marks(camera, tasks, workers)
+    )
 
 
-def _clicked(camera: CameraFile, clicks: Clicks, tasks: Sequence[ScanTask]) -> CameraFile:
+def _learn_clicked_marks(camera: CameraFile, clicks: Clicks, tasks: Sequence[ScanTask]) -> CameraFile:
     task = next((task for task in tasks if task.name == clicks.scan), None)
     if task is None:
         names = [task.name for task in tasks]
@@ -56,7 +60,7 @@ def _clicked(camera: CameraFile, clicks: Clicks, tasks: Sequence[ScanTask]) -> C
             f"{camera.path}: [clicks] scan names {clicks.scan!r}, which is none of this camera's scans. "
             f"They are {', '.join(names[:5])}{', ...' if len(names) > 5 else ''}."
         )
-    with task.opened() as scan:
+    with task.open() as scan:
         if clicks.sha256 and clicks.sha256 != content_hash(scan.path):
             raise InputError(
                 f"{camera.path}: its marks were shown in {clicks.scan}, whose file is another one since. Click them "
@@ -127,7 +131,7 @@ def _learn_recurring_marks(camera: CameraFile, tasks: Sequence[ScanTask], worker
         one.id: Affine(matrix).apply(np.array(one.xy_mm) + each.offset_mm)
         for one, each in zip(camera.learned, found, strict=True)
     }
-    with task.opened() as scan:
+    with task.open() as scan:
         return _start(camera, task, scan, matrix, px, alike=tuple(task.name for task in tasks))
 
 
@@ -138,7 +142,7 @@ def _recurrence(job: tuple[Window, list[Window], float]) -> Recurrence:
 def _view(task: ScanTask) -> tuple[Array, Mapping[str, Window]] | None:
     """Approximate placement of the frame, and a window around every learned mark; None without drawn marks or scan."""
     camera = task.options.camera
-    with suppress(MeasurementError), task.opened() as scan:
+    with suppress(MeasurementError), task.open() as scan:
         placement = _drawn_placement(task.options, scan)
         if placement is None and len(camera.layout_marks) >= 2:
             return None

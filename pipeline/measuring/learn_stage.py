@@ -60,7 +60,7 @@ def learn_marks(
     for name, camera in known.cameras.items():
         if camera.learned:
             place = folder / f"{files[camera.path]}.toml"
-            cameras[name] = _learned(project, camera, place, reporter, measure, workers)
+            cameras[name] = _learn_marks(project, camera, place, reporter, measure, workers)
             if place.exists():
                 memory.remember(_key(project, camera), {"file": place.name, "sha256": hash_file(place)})
     return replace(project, cameras=cameras)
@@ -109,23 +109,23 @@ def _check_learned_scan(project: Project, camera: CameraFile) -> CameraFile:
     return replace(camera, fiducials=fiducials, learned_from=None)
 
 
-def _learned(
+def _learn_marks(
     project: Project, camera: CameraFile, place: Path, reporter: Reporter, measure: Measure, workers: Executor | None
 ) -> CameraFile:
     names = [name for name in project.scans if project.image_camera(name).path == camera.path]
     if not names:
         return camera
-    with reporter.stage("learning marks, step") as tell:
-        tell(f"{camera.name}: their first pictures", 0, 3)
+    with reporter.stage("learning marks, step") as count:
+        count(f"{camera.name}: their first pictures", 0, 3)
         start = first_pictures(camera, _tasks(project, camera, names), workers)
-        tell(f"{camera.name}: sought in {len(names)} scans by these", 1, 3)
+        count(f"{camera.name}: sought in {len(names)} scans by these", 1, 3)
         chips, rivals = _chips(camera.learned, start, _tasks(project, start, names), measure, workers)
         if rivals:
             start = _average_origins(start, rivals)
             chips, _ = _chips(camera.learned, start, _tasks(project, start, names), measure, workers)
-        tell(f"{camera.name}: averaged", 2, 3)
-        mean = _averaged(start, camera.learned, chips, workers)
-    return _stored(mean, place, _learned_folder(project))
+        count(f"{camera.name}: averaged", 2, 3)
+        mean = _average_chips(start, camera.learned, chips, workers)
+    return _store_camera(mean, place, _learned_folder(project))
 
 
 def _tasks(project: Project, camera: CameraFile, names: Sequence[str]) -> list[ScanTask]:
@@ -165,7 +165,7 @@ def _learned_chips(learned: Sequence[GivenFiducial], named: tuple[ScanTask, Fram
     matrix = frame.pixel_from_camera
     assert matrix is not None
     found = {mark.point: mark.center_px for mark in frame.marks if mark.status.is_observation}
-    with task.opened() as scan:
+    with task.open() as scan:
         return {
             one.id: cut(scan, np.column_stack([matrix[:, :2], center]), one.learned_mm, frame.weights)
             for one in learned
@@ -173,7 +173,7 @@ def _learned_chips(learned: Sequence[GivenFiducial], named: tuple[ScanTask, Fram
         }
 
 
-def _averaged(
+def _average_chips(
     start: CameraFile, learned: Sequence[GivenFiducial], chips: Mapping[str, list[Chip]], workers: Executor | None
 ) -> CameraFile:
     found = [one for one in learned if one.id in chips]
@@ -203,7 +203,7 @@ def _average_origins(camera: CameraFile, poses: Collection[str]) -> CameraFile:
     return replace(camera, fiducials=tuple(moved.get(one.id, one) for one in camera.fiducials))
 
 
-def _stored(camera: CameraFile, place: Path, folder: Path) -> CameraFile:
+def _store_camera(camera: CameraFile, place: Path, folder: Path) -> CameraFile:
     """Write the camera to place, of later folder; return it as read back, so that later runs measure the same."""
     save = picture_writer(place.parent, f"{place.stem}-")
     write_atomically(place, camera_text(replace(camera, path=place), save))
@@ -241,9 +241,9 @@ def collect_tones(
     samples = {kind: sample_names(kinds[kind], _SAMPLES) for kind, by_image in before.items() if by_image is None}
     tasks = [task.fiducials_alone(project.tone) for task in scan_tasks(project, list(chain(*samples.values())))]
     known = {name: read_plain(ToneInformation, one) for kept in before.values() for name, one in (kept or {}).items()}
-    with reporter.stage("tone curve from scan") as tell:
+    with reporter.stage("tone curve from scan") as count:
         for done, scan in enumerate(measure(tasks), 1):
-            tell(scan.frame.image, done, len(tasks))
+            count(scan.frame.image, done, len(tasks))
             if scan.frame.tone is not None and scan.frame.tone.information is not None:
                 known[scan.frame.image] = scan.frame.tone.information
     for kind, names_of in samples.items():

@@ -122,5 +122,5 @@ def _repeated(
         sentence = f"{what}: it is one scan stored twice, and its marks count twice. Name one of both in `exclude`."
     if is_board or is_sure:
         kind: Kind | None = "target" if is_board else None
-        scan = scan.restated(kind, Status.REJECTED, Reason(f"{what}, which counts", Code.COPY))
+        scan = scan.with_status(kind, Status.REJECTED, Reason(f"{what}, which counts", Code.COPY))
     return scan.changed(problems=[Reason(sentence, Code.COPY)])

@@ -42,7 +42,7 @@ def name_roll(
     free = [scan for task, scan in both if task.options.fiducials.pose == "auto" and not scan.failure]
     poses = poses_of_roll(free, places)
     names = {scan.frame.image: scan.frame.pose.name for scan in free if scan.frame.pose}
-    again = [task.posed(poses[task.name].name) for task in tasks if task.name in poses]
+    again = [task.with_orientation(poses[task.name].name) for task in tasks if task.name in poses]
     other = [task for task in again if task.options.fiducials.pose != names.get(task.name)]
     new = {scan.frame.image: scan for scan in (measure(other) if other else ())}
     named = []
@@ -87,7 +87,7 @@ def add_known_lines(
     for task in tasks:
         lines = known.get(id(task.options.camera), ())
         if lines and task.name not in measured and task.options.fiducials.writing == "pose":
-            options.setdefault(id(task.options), task.changed(known_lines=lines).options)
+            options.setdefault(id(task.options), task.with_options(known_lines=lines).options)
             task = replace(task, options=options[id(task.options)])
         knowing.append(task)
     return tuple(knowing), measured
@@ -135,7 +135,7 @@ def poses_of_roll(scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace])
     usual = Counter(_turn(pose) for pose in poses.values())
     chosen = max(alike, key=lambda turn: (likelihoods[turn] > -TOLD, usual[turn]))
     undecided = [frame for frame in frames if frame.image in poses and not poses[frame.image].decided]
-    return {frame.image: _together(frame, chosen, len(alike) == 1, len(poses)) for frame in undecided}
+    return {frame.image: _joint_orientation(frame, chosen, len(alike) == 1, len(poses)) for frame in undecided}
 
 
 def _writing_likelihoods(frames: Sequence[FrameMeasurement], places: Sequence[WrittenPlace]) -> Mapping[str, float]:
@@ -152,8 +152,9 @@ def _writing_likelihoods(frames: Sequence[FrameMeasurement], places: Sequence[Wr
     return dict(zip(_TURNS, (likelihoods - likelihoods.max()).tolist(), strict=True))
 
 
-def _together(frame: FrameMeasurement, turn: str, told: bool, frames: int) -> ScanOrientation:
-    """Scan orientation of a frame with text in this direction. told: whether the frames together determine it."""
+def _joint_orientation(frame: FrameMeasurement, turn: str, is_determined: bool, frames: int) -> ScanOrientation:
+    """Scan orientation of a frame with text in this direction. is_determined: whether all frames
+    determine it."""
     assert frame.pose is not None
     pose = replace(frame.pose, name=_scan_pose(frame.pose, turn))
     plain, mirrored = (
@@ -167,7 +168,7 @@ def _together(frame: FrameMeasurement, turn: str, told: bool, frames: int) -> Sc
     if is_doubted or not is_face_known:
         like = f"named {pose.name} as the other frames of the camera, so that its writing lies as theirs."
         return replace(pose, evidence=(*pose.evidence, like)) if pose.name != frame.pose.name else pose
-    if not told:
+    if not is_determined:
         return replace(pose, evidence=(f"{_ONE_QUESTION}.", *pose.evidence[1:]), roll=_ONE_QUESTION)
     together = f"what is written lies alike in {frames} frames of the camera, and together they tell how it has it."
     return replace(pose, decided=True, evidence=(together, *pose.evidence[1:]))

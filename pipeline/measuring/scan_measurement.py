@@ -32,7 +32,7 @@ from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan
 from pipeline.results.thumbnail import ThumbnailRow, thumbnail_rows
 from pipeline.text.wording import capitalised
 
-SecondPass = Callable[[Scan, MeasuredScan], None]
+Inspection = Callable[[Scan, MeasuredScan], None]
 
 
 _FAILURES: Mapping[type[Exception], FailureCode] = {  # the first that fits
@@ -57,16 +57,16 @@ def ended_scan(task: ScanTask, error: Exception) -> MeasuredScan:
     )
 
 
-def measured_scan(task: ScanTask, look: SecondPass | None = None) -> MeasuredScan:
+def measured_scan(task: ScanTask, inspect: Inspection | None = None) -> MeasuredScan:
     """Measure one scan: its fiducials, then its targets.
 
     A scan that cannot be measured gives a result with the reason. Raises nothing but interrupts.
 
-    look: called with the open scan and its measurements.
+    inspect: called with the open scan and its measurements.
     """
     start = time.monotonic()
     try:
-        measured = _opened_and_measured(task, look)
+        measured = _open_and_measure(task, inspect)
     except Exception as error:
         measured = failed_scan(task, *_failure(task, error))
     return replace(measured, seconds=time.monotonic() - start)
@@ -103,8 +103,8 @@ def _failure(task: ScanTask, error: Exception) -> tuple[FailureCode, str]:
     )
 
 
-def _opened_and_measured(task: ScanTask, look: SecondPass | None) -> MeasuredScan:
-    with task.opened() as scan:
+def _open_and_measure(task: ScanTask, inspect: Inspection | None) -> MeasuredScan:
+    with task.open() as scan:
         options, fiducials = task.options, task.options.fiducials
         if isinstance(fiducials.lens, CalibratedLens) and (misfit := fiducials.lens.misfit(scan)):
             raise MeasurementError(misfit)
@@ -127,8 +127,8 @@ def _opened_and_measured(task: ScanTask, look: SecondPass | None) -> MeasuredSca
             measured = replace(measured, width_px=scan.width_px, height_px=scan.height_px, frame=frame)
         else:
             measured = _measure(task, scan, options)
-        if look is not None:
-            look(scan, measured)
+        if inspect is not None:
+            inspect(scan, measured)
         return measured
 
 

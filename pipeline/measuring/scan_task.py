@@ -86,7 +86,7 @@ class ScanTask:
         """The scan's address without secrets, for display and storage."""
         return public_address(self.scan)
 
-    def opened(self) -> "Scan":
+    def open(self) -> "Scan":
         """Open the scan. Raises MeasurementError where it cannot be read."""
         if not self.scan:
             raise MissingError(_NO_SCAN)
@@ -94,21 +94,21 @@ class ScanTask:
 
         return open_scan(scan_path(self.scan), self.max_pixels).replace_name(self.name)
 
-    def posed(self, pose: str) -> "ScanTask":
+    def with_orientation(self, pose: str) -> "ScanTask":
         """Copy with a known scan orientation; no text is read."""
-        return self.changed(pose=pose, writing="none", known_lines=())
+        return self.with_options(pose=pose, writing="none", known_lines=())
 
-    def changed(self, **fiducials: Any) -> "ScanTask":
+    def with_options(self, **fiducials: Any) -> "ScanTask":
         """Copy with other options of the fiducials."""
         return replace(self, options=replace(self.options, fiducials=replace(self.options.fiducials, **fiducials)))
 
     def fiducials_alone(self, tone: float | str) -> "ScanTask":
         """Copy that measures only the fiducials, with the given tone curve."""
-        task = self.changed(writing="none", known_lines=())
+        task = self.with_options(writing="none", known_lines=())
         return replace(task, options=replace(task.options, tone=tone, tone_information=(), targets=None, exterior=None))
 
 
-Measure = Callable[[Iterable[ScanTask]], Iterator[MeasuredScan]]  # runs tasks, or reads their results from a store
+Measure = Callable[[Iterable[ScanTask]], Iterator[MeasuredScan]]  # runs tasks, or reads their results from a database
 
 
 def scan_tasks(

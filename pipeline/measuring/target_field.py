@@ -243,16 +243,16 @@ def checked_places(
     verdicts = dict(zip(observed, zip(far.tolist(), comparison.chance.tolist(), strict=True), strict=True))
     checked = []
     for mark in marks:
-        off_px, chance = verdicts.get(mark.point, (0.0, 1.0))
-        if chance > TARGET_OFF_PLACE:
+        off_px, p_value = verdicts.get(mark.point, (0.0, 1.0))
+        if p_value > TARGET_OFF_PLACE:
             checked.append(mark)
             continue
         how = f"it lies {off_px:.2f} px from where the other targets put it"
-        if chance < TARGET_ELSEWHERE:
+        if p_value < TARGET_ELSEWHERE:
             wrong = Reason(f"another mark, or the point's coordinates are wrong: {how}", Code.OFF_PLACE)
             checked.append(replace(mark, status=Status.REJECTED, reason=wrong))
         else:
-            reason = Reason(f"{how}, as one of {1.0 / chance:.0f} right ones does", Code.OFF_PLACE)
+            reason = Reason(f"{how}, as one of {1.0 / p_value:.0f} right ones does", Code.OFF_PLACE)
             checked.append(replace(mark, status=Status.WEAK, reason=Reason.combine((mark.reason, reason))))
     return tuple(checked)
 

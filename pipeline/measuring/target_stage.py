@@ -17,17 +17,8 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
+from pipeline.measuring import target_field
 from pipeline.measuring.coded_targets import CodedPoints, measure_coded_field, measure_sheet
-from pipeline.measuring.target_field import (
-    LEAST_DIAMETER_PX,
-    TargetField,
-    absent_targets,
-    check_spacing,
-    checked_places,
-    measure_single_targets,
-    target_candidates,
-    target_field,
-)
 from pipeline.measuring.target_identification import (
     NamedField,
     camera_model,
@@ -60,7 +51,7 @@ class SoughtTargets:
     """
 
     settings: TargetSettings
-    field: TargetField
+    field: target_field.TargetField
     coded: CodedPoints | None
     surveyed: bool
     unit: str
@@ -73,7 +64,7 @@ class SoughtTargets:
         settings = project.targets
         assert settings is not None
         coded = CodedPoints.from_project(project, settings) if settings.code is not None else None
-        field = target_field(project)
+        field = target_field.target_field(project)
         if settings.board is None and coded is None:
             if project.given_points is None:
                 raise InputError(
@@ -86,7 +77,7 @@ class SoughtTargets:
                     f"{project.path}: [object] points: {len(field.ids)} points with X, Y and Z name no targets; give "
                     f"{LEAST_PAIRS}, if only roughly."
                 )
-            check_spacing(project, field)
+            target_field.check_spacing(project, field)
         return cls(settings, field, coded, project.given_points is not None, project.unit, project.unit_mm)
 
     @property
@@ -110,12 +101,12 @@ def measure_targets(
         return replace_targets(measured, *measure_sheet(scan, sought.coded))
     if sought.coded is not None:
         return replace_targets(measured, *measure_coded_field(scan, sought.coded, sought.field, camera, measured))
-    named, notes = _named(sought, camera, exterior, scan, measured)
+    named, notes = _identify_targets(sought, camera, exterior, scan, measured)
     if isinstance(named, str):
-        absent = absent_targets(sought.field.ids, named)
+        absent = target_field.absent_targets(sought.field.ids, named)
         return replace_targets(measured, absent, (*notes, f"No target has a name: {named}."))
-    fitted = measure_single_targets(scan, named.predictions(sought.field, measured), sought.settings)
-    return replace_targets(measured, checked_places(fitted, sought.field, named.model, measured), notes)
+    fitted = target_field.measure_single_targets(scan, named.predictions(sought.field, measured), sought.settings)
+    return replace_targets(measured, target_field.checked_places(fitted, sought.field, named.model, measured), notes)
 
 
 def _board(sought: SoughtTargets, spec: BoardSpec, scan: Scan, measured: MeasuredScan) -> MeasuredScan:
@@ -140,7 +131,7 @@ def replace_targets(
     return measured.changed([*fiducials, *targets], [Reason(problem, code) for problem in problems])
 
 
-def _named(
+def _identify_targets(
     sought: SoughtTargets, camera: CameraFile, exterior: Exterior | None, scan: Scan, measured: MeasuredScan
 ) -> tuple[NamedField | str, tuple[str, ...]]:
     """Identify the targets by the approximate orientation, else by the field's pattern, or tell why not; notes."""
@@ -158,14 +149,16 @@ def _named(
     extent = float(np.linalg.norm(np.ptp(field.xyz, axis=0)))
     filling = 2.0 * field.radius / extent * float(np.hypot(measured.width_px, measured.height_px))
     diameters = filling / _SIZES, filling * _SIZES
-    if diameters[1] < LEAST_DIAMETER_PX:
+    if diameters[1] < target_field.LEAST_DIAMETER_PX:
         too_small = (
             f"targets of {2.0 * field.radius * sought.unit_mm:g} mm in a field of {extent:g} {sought.unit} would have "
-            f"{diameters[1]:.2g} px at most, and {LEAST_DIAMETER_PX} are needed; is [object] unit the one of the "
-            f'coordinates? "{sought.unit}" is taken, "m" being the default'
+            f"{diameters[1]:.2g} px at most, and {target_field.LEAST_DIAMETER_PX} are needed; is [object] unit the one "
+            f'of the coordinates? "{sought.unit}" is taken, "m" being the default'
         )
         return too_small, notes
-    return name_field(field, model, camera, measured, target_candidates(scan, sought.settings, diameters)), notes
+    return name_field(
+        field, model, camera, measured, target_field.target_candidates(scan, sought.settings, diameters)
+    ), notes
 
 
 def _named_by_orientation(
@@ -177,10 +170,12 @@ def _named_by_orientation(
     size = np.array([measured.width_px, measured.height_px])
     near = [one for one in predictions if np.all(np.abs(one.center_px - size / 2.0) < _NEAR * size)]
     axes = np.array([one.half_axes_px for one in near]).reshape(-1, 2)
-    if not len(axes) or 2.0 * float(axes.max()) < LEAST_DIAMETER_PX:
-        return f"the approximate orientation puts no target of {LEAST_DIAMETER_PX} px or more into the scan"
+    if not len(axes) or 2.0 * float(axes.max()) < target_field.LEAST_DIAMETER_PX:
+        return (
+            f"the approximate orientation puts no target of {target_field.LEAST_DIAMETER_PX} px or more into the scan"
+        )
     diameters = 2.0 * float(axes.min()) / _SIZE_SLACK, 2.0 * float(axes.max()) * _SIZE_SLACK
-    strongest = target_candidates(scan, sought.settings, diameters)[: _STRONGEST * len(predictions)]
+    strongest = target_field.target_candidates(scan, sought.settings, diameters)[: _STRONGEST * len(predictions)]
     predicted, found = (np.array([one.center_px for one in some]).reshape(-1, 2) for some in (predictions, strongest))
     row = {id: i for i, id in enumerate(field.ids)}
     pattern = recognise(predicted, found, float(np.hypot(measured.width_px, measured.height_px)) / 2.0)
@@ -188,5 +183,5 @@ def _named_by_orientation(
     named = name_field(field, approximate, camera, measured, strongest, codes) if codes else ""
     if isinstance(named, NamedField):
         return named
-    chance = ", except for possible false alarms" if named else ""
-    return f"the {len(found)} marks found do not make the pattern of the {len(predicted)} targets predicted{chance}"
+    doubt = ", except for possible false alarms" if named else ""
+    return f"the {len(found)} marks found do not make the pattern of the {len(predicted)} targets predicted{doubt}"

@@ -61,7 +61,7 @@ def add_joins(
             joins = measure_joins(frames, workers=workers)
             problems = {image: (problem,) for image, problem in joins.problems.items()}
             with_joins = [_add_marks(scan, joins.marks, problems) for scan in parts]
-            joined |= {scan.frame.image: scan for scan in _agreed(with_joins)}
+            joined |= {scan.frame.image: scan for scan in _check_fiducials_by_joins(with_joins)}
         count(frame, done, len(by_frame))
     return tuple(joined.get(scan.frame.image, scan) for scan in scans)
 
@@ -84,7 +84,7 @@ def _occupied_places(marks: Sequence[MarkMeasurement]) -> Array:
     return np.array(places).reshape(-1, 3)
 
 
-def _agreed(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
+def _check_fiducials_by_joins(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
     """Check the fiducials of each pair of scans against one another through the joins."""
     result = {scan.frame.image: scan for scan in scans}
     checked = set[str]()
@@ -100,14 +100,14 @@ def _agreed(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
                 checked |= {first.frame.image, second.frame.image}
                 continue
             for scan, other in ((first, second), (second, first)):
-                result[scan.frame.image] = _contradicted(result[scan.frame.image], other, off_mm)
+                result[scan.frame.image] = _add_contradiction(result[scan.frame.image], other, off_mm)
     for image, scan in result.items():
         if image in checked:
             problems = tuple(problem for problem in scan.frame.problems if problem.codes != (Code.NO_CHECK,))
             result[image] = replace(scan, frame=replace(scan.frame, problems=problems))
         elif 0 < len(_fiducials(scan)) < _CHECKED:
             few = Reason("so few fiducials fit many frames, and no other part of this one checks them", Code.NO_CHECK)
-            result[image] = scan.restated("fiducial", Status.WEAK, few)
+            result[image] = scan.with_status("fiducial", Status.WEAK, few)
     # Fiducials outside of a scan that another partial scan shows are not missing.
     shown = {point: image for image, scan in reversed(result.items()) for point in _fiducials(scan)}
     agreed = []
@@ -155,7 +155,7 @@ def _discrepancy_mm(first: MeasuredScan, second: MeasuredScan) -> float | None:
     return float(np.sqrt(np.mean(off_px**2))) / (second.frame.px_per_mm or 1.0)
 
 
-def _contradicted(scan: MeasuredScan, other: MeasuredScan, off_mm: float) -> MeasuredScan:
+def _add_contradiction(scan: MeasuredScan, other: MeasuredScan, off_mm: float) -> MeasuredScan:
     """Add a problem; reject the fiducials of this scan if it has no more of them than the other."""
     what = (
         f"the fiducial marks contradict those of {other.frame.image}, another part of this frame: what joins both puts "
@@ -167,7 +167,7 @@ def _contradicted(scan: MeasuredScan, other: MeasuredScan, off_mm: float) -> Mea
         Code.AMBIGUOUS,
     )
     if len(_fiducials(scan)) <= len(_fiducials(other)):
-        scan = scan.restated("fiducial", Status.REJECTED, Reason(what, Code.AMBIGUOUS))
+        scan = scan.with_status("fiducial", Status.REJECTED, Reason(what, Code.AMBIGUOUS))
     return scan.changed(problems=[problem])
 
 

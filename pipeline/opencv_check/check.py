@@ -44,21 +44,13 @@ from pipeline.opencv_check.opencv_calibration import (
     calibrate,
     calibrate_fisheye,
     can_begin,
-    fixed,
+    fixed_distortion,
     model_names,
     opencv_values,
-    to_opencv_model,
 )
+from pipeline.results import stage_files
 from pipeline.results.adjustment_record import Quantity
 from pipeline.results.comparator_file import comparator_from_pixel
-from pipeline.results.stage_files import (
-    CameraCheck,
-    Check,
-    ComparedParameter,
-    CornersCheck,
-    PixelCalibration,
-    Verdict,
-)
 from pipeline.types import Array
 
 GROSS_WEIGHT = 0.5  # observations with a lower robust weight are left out
@@ -89,12 +81,12 @@ LARGEST_SIGMA_RATIO = 1.2  # ratio of standard deviations; 1.006 to 1.03 is usua
 SAME_MODEL_DIFFERENCE = 0.1  # sigmas, where both programs use the identical model
 SAME_MODEL_SIGMA_RATIO = 1.02  # the same of standard deviations
 LARGEST_DEPARTURE = 3.0  # sigmas, largest accepted change of a parameter by priors, weights etc.
-NOTABLE_DEPARTURE = 0.1  # standard deviations from which a departure is told
+NOTABLE_DEPARTURE = 0.1  # standard deviations from which a departure is reported
 LARGEST_REFIT = 0.5  # fraction of an image coordinate's sigma: above it, OpenCV's model does not fit the lens
 UNDETERMINED = 0.05  # relative sigma of the principal distance above which no comparison is possible
 WORSE_RMS = 1.02  # ratio of OpenCV's rms to the adjustment's that shows that its iteration stopped early
 ROUNDINGS = 20.0  # rms, in units of OpenCV's rounding of one coordinate, below which rounding dominates the residuals
-NOTABLE_SPREAD = 1.5  # ratio of the largest to the smallest sigma of marks, from which it is told
+NOTABLE_SPREAD = 1.5  # ratio of the largest to the smallest sigma of marks, from which it is reported
 NOTABLE_ROUNDING = 0.01  # fraction of the standard deviation of an image coordinate
 
 
@@ -123,7 +115,7 @@ class BareProblem:
 
 
 @dataclass(frozen=True)
-class Converted:
+class ConvertedSolution:
     """A solution in OpenCV's model.
 
     Attributes
@@ -205,7 +197,7 @@ def find_points(picture: Bytes, board: BoardSpec) -> Array:
 
 def compare_corners(
     images: Sequence[OpenCVPoints], pictures: BoardPictures, calibrate: Calibrate
-) -> CornersCheck | None:
+) -> stage_files.CornersCheck | None:
     """Calibrate the measured points and OpenCV's own points with OpenCV, using the points that both have.
 
     Returns None where too few images are available, or OpenCV finds the board in too few of them.
@@ -230,7 +222,7 @@ def compare_corners(
     except (cv2.error, NoRedundancyError):
         return None
     pitch_mm = np.array(pictures.pitch_um[both[0][0].image]) / 1000.0
-    return CornersCheck(
+    return stage_files.CornersCheck(
         detector_name(pictures.board),
         len(both),
         sum(len(image.xyz) for image, _ in both),
@@ -240,12 +232,12 @@ def compare_corners(
     )
 
 
-def _pixel_calibration(calibration: OpenCvCalibration, pitch_mm: Array) -> PixelCalibration:
+def _pixel_calibration(calibration: OpenCvCalibration, pitch_mm: Array) -> stage_files.PixelCalibration:
     fx, fy, cx, cy = (calibration.parameters[:4] / np.tile(pitch_mm, 2) * (1.0, 1.0, 1.0, -1.0)).tolist()
-    return PixelCalibration(fx, fy, cx, cy, calibration.rms_um / 1000.0 / float(np.sqrt(pitch_mm.prod())))
+    return stage_files.PixelCalibration(fx, fy, cx, cy, calibration.rms_um / 1000.0 / float(np.sqrt(pitch_mm.prod())))
 
 
-def check_against_opencv(adjustment: Adjustment, pictures: BoardPictures | None = None) -> Check:
+def check_against_opencv(adjustment: Adjustment, pictures: BoardPictures | None = None) -> stage_files.Check:
     """Compare every camera of an adjustment with OpenCV's calibration of the same observations.
 
     The verdicts are "agrees": no parameter differs by more than one sigma; or a strong distortion does not fit OpenCV's
@@ -264,8 +256,8 @@ def check_against_opencv(adjustment: Adjustment, pictures: BoardPictures | None 
             verdict, reason = _compare(adjustment, camera.name, pictures, known)
         except _NotPossible as hindrance:
             verdict, reason = "not possible", str(hindrance)
-        checks[camera.name] = CameraCheck(verdict, reason, **known)
-    return Check.from_cameras(checks)
+        checks[camera.name] = stage_files.CameraCheck(verdict, reason, **known)
+    return stage_files.Check.from_cameras(checks)
 
 
 class _NotPossible(Exception):
@@ -326,7 +318,7 @@ class _Solutions:
 
     problem: BareProblem
     solved: Adjustment
-    conversion: Converted
+    conversion: ConvertedSolution
     opencv: OpenCvCalibration
 
     @property
@@ -344,7 +336,7 @@ class _Solutions:
         return self.solved.inseparable(self.camera.name)
 
     @cached_property
-    def rows(self) -> tuple[ComparedParameter, ...]:
+    def rows(self) -> tuple[stage_files.ComparedParameter, ...]:
         """Parameters that are compared: all estimated ones but inseparable terms."""
         sigma0 = self.solved.sigma0 if self.has_residuals else 1.0
         names = model_names(self.camera.distortion.family)
@@ -354,7 +346,7 @@ class _Solutions:
 
 def _compare(
     adjustment: Adjustment, name: str, pictures: BoardPictures | None, known: dict[str, Any]
-) -> tuple[Verdict, str]:
+) -> tuple[stage_files.Verdict, str]:
     """Verdict and its reason; intermediate results are added to known. Raises _NotPossible."""
     if hindrance := _hindrance(adjustment, name):
         raise _NotPossible(hindrance)
@@ -369,14 +361,7 @@ def _compare(
     calibrated = partial(
         calibrate_fisheye if is_fisheye else calibrate, freedom=problem.freedom, start=conversion.parameters
     )
-    try:
-        opencv = calibrated(problem.images)
-    except cv2.error as error:
-        raise _NotPossible(f"OpenCV refuses these observations: {error.err}.") from None
-    except NoRedundancyError as error:
-        raise _NotPossible(
-            f"There is nothing to compare: {error}. Take more pictures, or measure more points."
-        ) from None
+    opencv = _opencv_solution(problem.images, calibrated)
     solutions = _Solutions(problem, solved, conversion, opencv)
     if not solutions.rows:
         raise _NotPossible(
@@ -398,15 +383,27 @@ def _compare(
     return verdict, f"{reason} {_notes(solutions)}"
 
 
+def _opencv_solution(images: Sequence[OpenCVPoints], calibrated: Calibrate) -> OpenCvCalibration:
+    """Calibrate by OpenCV. Raises _NotPossible where it cannot."""
+    try:
+        return calibrated(images)
+    except cv2.error as error:
+        raise _NotPossible(f"OpenCV refuses these observations: {error.err}.") from None
+    except NoRedundancyError as error:
+        raise _NotPossible(
+            f"There is nothing to compare: {error}. Take more pictures, or measure more points."
+        ) from None
+
+
 def _rms_um(solved: Adjustment) -> float:
     """Rms of the residuals of a point."""
     return 1e3 * float(np.sqrt((solved.residuals.v_mm**2).sum(axis=1).mean()))
 
 
-def _conversion(problem: BareProblem, solved: Adjustment, known: dict[str, Any]) -> Converted:
+def _conversion(problem: BareProblem, solved: Adjustment, known: dict[str, Any]) -> ConvertedSolution:
     """Convert a solution to OpenCV's model. Raises _NotPossible where that has no such lens."""
     try:
-        conversion = converted(problem, solved)
+        conversion = convert_solution(problem, solved)
     except AdjustmentError as error:
         raise _NotPossible(f"OpenCV's model cannot take this lens: {error}") from None
     sigma_um, refit_um = 1e3 * problem.sigma_mm, 1e3 * conversion.residual_mm
@@ -419,7 +416,7 @@ def _conversion(problem: BareProblem, solved: Adjustment, known: dict[str, Any])
     return conversion
 
 
-def _verdict(solutions: _Solutions, adjustment: Adjustment) -> tuple[Verdict, str]:
+def _verdict(solutions: _Solutions, adjustment: Adjustment) -> tuple[stage_files.Verdict, str]:
     """Verdict and reason from the parameters of both programs, then from what priors and weights change."""
     # Pseudo-observations along the valley, which OpenCV has not, make the other standard deviations smaller.
     verdict, reason = _agreement(solutions.rows, solutions.has_residuals and not solutions.inseparable)
@@ -446,10 +443,10 @@ def _is_digital(adjustment: Adjustment, problem: BareProblem) -> bool:
 
 
 def _rows(
-    names: Sequence[str], freedom: Freedom, conversion: Converted, sigma0: float, opencv: OpenCvCalibration
-) -> tuple[ComparedParameter, ...]:
+    names: Sequence[str], freedom: Freedom, conversion: ConvertedSolution, sigma0: float, opencv: OpenCvCalibration
+) -> tuple[stage_files.ComparedParameter, ...]:
     return tuple(
-        ComparedParameter.from_numbers(
+        stage_files.ComparedParameter.from_numbers(
             name,
             "mm" if name in INTERIOR else "rad" if name in ("tau_x", "tau_y") else "1",
             Quantity(float(conversion.parameters[k]), float(sigma0 * conversion.sigmas[k])),
@@ -460,7 +457,7 @@ def _rows(
     )
 
 
-def _agreement(rows: Sequence[ComparedParameter], sigmas_tell: bool) -> tuple[Verdict, str]:
+def _agreement(rows: Sequence[stage_files.ComparedParameter], sigmas_tell: bool) -> tuple[stage_files.Verdict, str]:
     """Verdict from the parameters. sigmas_tell: whether the residuals are larger than OpenCV's rounding."""
     worst = max(rows, key=lambda row: row.difference_sigmas)
     loosest = max(rows, key=_sigma_ratio)
@@ -473,7 +470,7 @@ def _agreement(rows: Sequence[ComparedParameter], sigmas_tell: bool) -> tuple[Ve
     return "agrees", f"All {len(rows)} parameters agree: {found}."
 
 
-def _sigma_ratio(row: ComparedParameter) -> float:
+def _sigma_ratio(row: stage_files.ComparedParameter) -> float:
     smaller, larger = sorted((row.reseau.sigma, row.opencv.sigma))
     return larger / smaller if smaller > 0 else np.inf
 
@@ -487,17 +484,17 @@ def _same_model_agrees(solutions: _Solutions) -> bool:
     values = {"c": fy, "x0": x0, "y0": y0, "b1": fx / fy - 1, "b2": 0.0}
     values |= dict(zip(NAMES[4:], distortion, strict=True))
     free = {"c", "x0", "y0", *problem.freedom.distortion}.difference(problem.freedom.held_interior)
-    camera = _freed(problem.network.cameras[0], Distortion("opencv"), values, free)
+    camera = _free_camera(problem.network.cameras[0], Distortion("opencv"), values, free)
     approximations = replace(problem.approximations, interior={camera.name: np.array([fy, x0, y0])})
     same = replace(problem, network=replace(problem.network, cameras=(camera,)), approximations=approximations)
     solved = adjust(same.network, same.approximations)
     if not solved.converged:
         return False
-    rows = _rows(NAMES, same.freedom, converted(same, solved), solved.sigma0, solutions.opencv)
+    rows = _rows(NAMES, same.freedom, convert_solution(same, solved), solved.sigma0, solutions.opencv)
     return all(r.difference_sigmas < SAME_MODEL_DIFFERENCE and _sigma_ratio(r) < SAME_MODEL_SIGMA_RATIO for r in rows)
 
 
-def _judge_departure(reason: str, adjustment: Adjustment, solutions: _Solutions) -> tuple[Verdict, str]:
+def _judge_departure(reason: str, adjustment: Adjustment, solutions: _Solutions) -> tuple[stage_files.Verdict, str]:
     """Verdict from the agreement on the bare problem and the departures of the full adjustment from it."""
     solved, camera = solutions.solved, solutions.camera
     departures = {  # in standard deviations of the bare problem
@@ -564,7 +561,7 @@ def bare_problem(adjustment: Adjustment, camera_name: str) -> BareProblem:
     }
     return BareProblem(
         network=Network(
-            cameras=(_freed(camera, camera.distortion, values, free),),
+            cameras=(_free_camera(camera, camera.distortion, values, free),),
             images=tuple(Image(name, camera_name, "none") for name in usable),
             points=tuple(
                 ObjectPoint(point, *(Prior(value, 0.0) for value in xyz))
@@ -611,7 +608,7 @@ def free_parameters(camera: Camera) -> set[str]:
     return free | ({"b1"} if camera.distortion.family == FISHEYE and "c" in free else set())
 
 
-def _freed(camera: Camera, distortion: Distortion, values: Mapping[str, float], free: set[str]) -> Camera:
+def _free_camera(camera: Camera, distortion: Distortion, values: Mapping[str, float], free: set[str]) -> Camera:
     """Camera of a distortion model without fiducials and priors. free: parameters that are estimated."""
     priors = {name: Prior(value, np.inf if name in free else 0.0) for name, value in values.items()}
     parameters = {name: priors[name] for name in parameter_names(distortion.family)}
@@ -653,7 +650,7 @@ def _observations(shown: Mapping[str, tuple[OpenCVPoints, Array, list[str]]], si
     )
 
 
-def converted(problem: BareProblem, solved: Adjustment) -> Converted:
+def convert_solution(problem: BareProblem, solved: Adjustment) -> ConvertedSolution:
     """Convert a solution to OpenCV's model. Raises AdjustmentError where the fit fails."""
     camera = problem.network.cameras[0]
     family = camera.distortion.family
@@ -662,17 +659,20 @@ def converted(problem: BareProblem, solved: Adjustment) -> Converted:
     if family == FISHEYE or (family == "opencv" and lens.parameters[-1] == 0.0):  # without shear: OpenCV's own model
         parameters, by_lens = opencv_values(lens)
         variances = np.diag(by_lens @ solved.cofactor_of(own) @ by_lens.T)
-        return Converted(parameters, np.sqrt(np.maximum(variances, 0.0)), 0.0)
+        return ConvertedSolution(parameters, np.sqrt(np.maximum(variances, 0.0)), 0.0)
     observed = problem.network.observations.xy_mm
     corners_mm = np.array([observed.min(axis=0), observed.max(axis=0)])
-    fitted = ("k1", "k2", "p1", "p2", "k3", *(["b1"] if "fy" in COUNTERPARTS[family].values() else []))
-    whole = to_opencv_model(lens, corners_mm, ("b1",) if family == "opencv" else fitted)
+    if family == "opencv":  # all but the shear b2, which cv2.calibrateCamera does not model
+        begun = dict(zip(lens.quantities[3:], lens.parameters.tolist(), strict=True)) | {"b2": 0.0}
+        whole = convert_lens(lens, fixed_distortion(begun), corners_mm, ("b1",))
+    else:
+        affinity = ["b1"] if "fy" in COUNTERPARTS[family].values() else []
+        whole = convert_lens(lens, Distortion("opencv"), corners_mm, ("k1", "k2", "p1", "p2", "k3", *affinity))
     # OpenCV holds the parameters that it does not estimate at these values. Its standard deviations assume them.
-    held = dict(zip(whole.lens.quantities[3:], whole.lens.parameters.tolist(), strict=True))
-    model = fixed(whole.lens.distortion.family, held)
+    model = fixed_distortion(dict(zip(whole.lens.quantities[3:], whole.lens.parameters.tolist(), strict=True)))
     known = replace(lens, covariance=solved.cofactor_of(own))
     free = convert_lens(known, model, corners_mm, problem.freedom.distortion, held=problem.freedom.held_interior)
     parameters, _ = opencv_values(whole.lens)
     _, by_lens = opencv_values(free.lens)
     covariance = by_lens @ free.lens.covariance @ by_lens.T
-    return Converted(parameters, np.sqrt(np.maximum(np.diag(covariance), 0.0)), whole.rms_mm)
+    return ConvertedSolution(parameters, np.sqrt(np.maximum(np.diag(covariance), 0.0)), whole.rms_mm)

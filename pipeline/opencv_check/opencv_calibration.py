@@ -11,9 +11,7 @@ import cv2
 import numpy as np
 
 from adjust.functional_model import opencv_family
-from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Distortion, Lens, Prior
-from adjust.functional_model.lens_conversion import ConvertedLens, convert_lens
 from measure.scans.parallel import one_opencv_thread
 from pipeline.types import Array
 
@@ -73,29 +71,9 @@ def model_names(family: str) -> tuple[str, ...]:
     return FISHEYE_NAMES if family == FISHEYE else NAMES
 
 
-def to_opencv_model(lens: Lens, corners_mm: Array, estimated: Sequence[str]) -> ConvertedLens:
-    """Convert a lens to the adjustment's family of OpenCV's model, over the rectangle between two corners (2, 2).
-
-    Parameters
-    ----------
-    estimated : parameters that are fitted. If the lens has such a family already, its other parameters keep their
-        values, except the shear b2, which cv2.calibrateCamera does not model.
-
-    Raises
-    ------
-    AdjustmentError : the fit does not converge.
-    """
-    family = lens.distortion.family
-    own = dict(zip(parameter_names(family), lens.parameters.tolist(), strict=True))
-    begun = own if family in ("opencv", FISHEYE) else {}
-    if family == "opencv":
-        begun = own | {"b2": 0.0}
-    model = FISHEYE if family == FISHEYE else "opencv"
-    return convert_lens(lens, fixed(model, begun), corners_mm, estimated)
-
-
-def fixed(family: str, values: Mapping[str, float]) -> Distortion:
-    return Distortion(family, {name: Prior(value, 0.0) for name, value in values.items()})
+def fixed_distortion(values: Mapping[str, float]) -> Distortion:
+    """Distortion in OpenCV's model with all parameters held."""
+    return Distortion("opencv", {name: Prior(value, 0.0) for name, value in values.items()})
 
 
 def opencv_values(lens: Lens) -> tuple[Array, Array]:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-import cv2
 import numpy as np
 from pydantic import Field
 
@@ -14,6 +13,8 @@ from adjust.functional_model.lens import Prior
 from measure.marks import shapes
 from pipeline.files.camera_file import CameraFile, camera_text
 from pipeline.files.mark_table import picture_writer
+from pipeline.files.object_files import ELEMENTS
+from pipeline.files.opencv_file import yaml_text
 from pipeline.files.project_tables import UNITS_MM
 from pipeline.rendered.scene_tables import DesignSettings
 from pipeline.text.csv_table import csv_line
@@ -101,15 +102,12 @@ def write_project(scene_file: SceneFile, out_dir: Path) -> None:
 def taking_camera_yaml(scene: scenes.Scene, lens: scenes.SceneTakingLens) -> str:
     """The true lens of the camera that photographed the film, for cv2.FileStorage."""
     geometry = frame_geometry(scene, 0)
-    size = geometry.width_px, geometry.height_px
-    center = lens.center_px or ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0)
-    f, (cx, cy) = lens.focal_px, center
-    storage = cv2.FileStorage("", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML)
-    storage.write("image_width", size[0])
-    storage.write("image_height", size[1])
-    storage.write("camera_matrix", np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]]))
-    storage.write("distortion_coefficients", np.array([[lens.k1, lens.k2, lens.p1, lens.p2, lens.k3]]))
-    return str(storage.releaseAndGetString())
+    width, height = geometry.width_px, geometry.height_px
+    f, (cx, cy) = lens.focal_px, lens.center_px or ((width - 1) / 2.0, (height - 1) / 2.0)
+    matrix = np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
+    distortion = np.array([[lens.k1, lens.k2, lens.p1, lens.p2, lens.k3]])
+    size = [("image_width", width), ("image_height", height)]
+    return yaml_text([*size, ("camera_matrix", matrix), ("distortion_coefficients", distortion)])
 
 
 def _given_camera(scene_file: SceneFile, generator: np.random.Generator) -> CameraFile:
@@ -160,7 +158,7 @@ def _points_csv(scene_file: SceneFile, targets: tuple[Target, ...], generator: n
 
 def _images_csv(scene_file: SceneFile, middle: Array, generator: np.random.Generator) -> str:
     """images.csv; the orientation of a frame scanned in parts is given for the first part only."""
-    columns = ["image", "X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg"]
+    columns = ["image", *ELEMENTS]
     images = scene_file.scene.images
     has_parts = any(image.part_of for image in images)
     rows, written = [], set[str]()

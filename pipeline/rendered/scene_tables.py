@@ -9,8 +9,9 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from adjust.solution.options import Datum
 from measure.targets.ring_codes import RingCode
-from pipeline.files.project_tables import UNITS_MM, Datum, Film, ScannerSetting, ScannerSigma, scanner_setting
+from pipeline.files.project_tables import UNITS_MM, Film, ScannerSetting, ScannerSigma, scanner_setting
 from pipeline.text import table_models as models
 from pipeline.text.table_models import number, numbers
 from pipeline.text.toml_tables import Table

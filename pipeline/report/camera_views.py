@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 from markupsafe import Markup
 
+from adjust.functional_model.distortion_models import UM_PER_MM
 from adjust.functional_model.families import parameter_names
 from adjust.problem.parameter import Parameter
 from adjust.quality.lens_uncertainty import distortion_curves, is_defined_over_frame
@@ -19,7 +20,7 @@ from pipeline.report.parameters import camera_values, parameter_rows, term_rows
 from pipeline.report.vectors import grid_mm, longest_vector, padded_plane, strokes_and_dots
 from pipeline.results.adjustment_file import ParameterCovariance
 from pipeline.results.adjustment_record import AdjustmentRecord, CameraRecord, JoinedFrameRecord, ScannerRecord
-from pipeline.results.image_unit import UM_PER_MM, ImageUnit
+from pipeline.results.image_unit import ImageUnit
 from pipeline.types import Array
 
 PLOT_PX = 400.0

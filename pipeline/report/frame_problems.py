@@ -40,7 +40,7 @@ class AlikeProblems:
     images: list[str]
     differ: bool = False
 
-    def together(self) -> ReportedProblem:
+    def merged_problem(self) -> ReportedProblem:
         """The first problem, with the names of all images."""
         numbers = f" (numbers of {self.images[0]})" if self.differ else ""
         return replace(self.first, what=f"{listed(self.images)}{numbers}: {self.first.what}", images=tuple(self.images))
@@ -90,10 +90,10 @@ def centers_px(frame: ReportedFrame) -> Iterator[Array]:
 def places_apart(centers: ArrayLike) -> dict[str, Array]:
     """Distinct columns and rows of centres (n, 2); see `places_px`."""
     columns, rows = np.asarray(centers, dtype=np.float64).reshape(-1, 2).T
-    return {"column": _apart(columns), "row": _apart(rows)}
+    return {"column": _distinct_positions(columns), "row": _distinct_positions(rows)}
 
 
-def _apart(positions_px: Array) -> Array:
+def _distinct_positions(positions_px: Array) -> Array:
     """Positions, sorted, without those within SAME_PLACE_PX of the last one kept."""
     kept: list[float] = []
     for position in np.sort(positions_px).tolist():
@@ -163,7 +163,7 @@ def frame_problems(shots: list[ReportedFrame]) -> Iterator[ReportedProblem]:
         gathered: Gathered = {}
         for frame in shots:
             gather(gathered, frame.image, evidence(frame))
-        yield from (each.together() for each in gathered.values())
+        yield from (each.merged_problem() for each in gathered.values())
 
 
 def gather(gathered: Gathered, image: str, problems: Iterable[ReportedProblem]) -> None:

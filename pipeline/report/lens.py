@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from markupsafe import Markup
 
+from adjust.display import BAND
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Lens
 from adjust.problem.parameter import Parameter
@@ -27,7 +28,6 @@ from pipeline.results.image_unit import FILM_UNIT, ImageUnit
 from pipeline.types import Array
 
 FRAME_GRID = 17
-BAND = 1.959964  # half width of a 95 % band, in sigmas
 
 # Field angles of the U.S. Geological Survey's calibration reports; those beyond the frame are left out.
 ANGLES_DEG = (7.5, 15.0, 22.7, 30.0, 35.0, 40.0)
@@ -78,11 +78,9 @@ class LensMap:
     largest_um: tuple[float, float]
 
 
-def lens(name: str, camera: CameraRecord, covariance: ParameterCovariance | None = None) -> Lens:
-    """Lens of a camera in adjustment.json, with its covariance if given."""
+def lens(name: str, camera: CameraRecord, covariance: ParameterCovariance) -> Lens:
+    """Lens of a camera in adjustment.json, with its covariance."""
     known = camera.lens()
-    if covariance is None:
-        return known
     keys = [Parameter.interior(name, each) for each in known.quantities]
     return replace(known, covariance=covariance.select_larger(keys))
 

@@ -14,7 +14,7 @@ import numpy as np
 from measure.flags import Status
 from measure.scans.remote import whole_file
 from pipeline.archive import made_from as provenance
-from pipeline.archive.checked_results import Judging, measured_scans, stored_judging, written_judging
+from pipeline.archive.checked_results import CheckRun, measured_scans, stored_check_run, written_check_run
 from pipeline.archive.review_decisions import inapplicable
 from pipeline.archive.verdicts import Verdict
 from pipeline.errors import InputError
@@ -60,7 +60,7 @@ class _FrameCounts:
     @property
     def totals(self) -> FrameTotals:
         ordered = sorted(self.gathered.values(), key=lambda each: -len(each.images))
-        problems = [each.together() for each in ordered[:_MOST_PROBLEMS]]
+        problems = [each.merged_problem() for each in ordered[:_MOST_PROBLEMS]]
         if rest := sum(len(each.images) for each in ordered[_MOST_PROBLEMS:]):
             what = f"{counted(rest, 'more problem')} of frames, all different."
             problems.append(ReportedProblem(what, "`reseau status --csv` has them."))
@@ -77,7 +77,7 @@ class _FrameCounts:
         for center in centers_px(frame):
             self.centers_px.extend(center.tolist())
 
-    def add_plain(self, stored: Judging, image_camera: Callable[[str], str]) -> None:
+    def add_plain(self, stored: CheckRun, image_camera: Callable[[str], str]) -> None:
         """Add the stored frames without problems."""
         counts = {result: Counter[str]() for _, _, result in stored.plain}
         for result, kind, status, col_px, row_px in stored.plain_marks():
@@ -93,8 +93,8 @@ class _FrameCounts:
             self.marks[image] = alike.setdefault(frozenset(count.items()), count)
 
 
-def reduced(
-    data: ReportData, scans: Iterable[MeasuredScan], image_camera: Callable[[str], str], stored: Judging | None = None
+def reduce_data(
+    data: ReportData, scans: Iterable[MeasuredScan], image_camera: Callable[[str], str], stored: CheckRun | None = None
 ) -> ReportData:
     """Reduce the data to the totals of all frames and the worst of the frames that need a look.
 
@@ -209,8 +209,8 @@ def measured_data(
     digest, path = read_measurement_hash(comparator), project.measurement_path
     if not path.exists():
         return data
-    with stored_judging(path, digest) as judging:
-        made, lines = None if judging is None else judging.made_from, inapplicable(judging)
+    with stored_check_run(path, digest) as check_run:
+        made, lines = None if check_run is None else check_run.made_from, inapplicable(check_run)
     if made is None and not digest:
         return replace(data, notes=(*data.notes, f"{comparator.name} was given: {path.name} says nothing of it."))
     if made is None:
@@ -259,22 +259,22 @@ def report_data(project: Project, at: At) -> ReportData:
     def image_camera(image: str) -> str:
         return project.image_camera(image).name
 
-    with _stored(project, at) as stored:
+    with _stored_checks(project, at) as stored:
         if stored is not None and len(stored.names) > MOST_FRAMES:
             needed = stored.names - {image for image, _, _ in stored.plain}
             data = measured_data(project, at, rows=list(stored.points(needed)))
-            return reduced(data, stored.scans(needed), image_camera, stored)
+            return reduce_data(data, stored.scans(needed), image_camera, stored)
     data = adjusted_data(project, at, MOST_FRAMES)
     return (
         data
         if _frame_count(data) <= MOST_FRAMES
-        else reduced(data, unread_scans(data, project.measurement_path), image_camera)
+        else reduce_data(data, unread_scans(data, project.measurement_path), image_camera)
     )
 
 
 def frame_data(project: Project, at: At, images: Collection[str]) -> ReportData:
     """Load all data of some images. Raises InputError for an unknown image."""
-    with _stored(project, at) as stored:
+    with _stored_checks(project, at) as stored:
         if stored is None:
             data = adjusted_data(project, at, 0)
         else:
@@ -287,11 +287,11 @@ def frame_data(project: Project, at: At, images: Collection[str]) -> ReportData:
     return replace(data, comparator=[row for row in data.comparator if row.image in images], measurement=scans)
 
 
-def _stored(project: Project, at: At) -> AbstractContextManager[Judging | None]:
+def _stored_checks(project: Project, at: At) -> AbstractContextManager[CheckRun | None]:
     """Stored marks, not all of which need be read, if comparator.csv is unchanged and nothing is adjusted."""
     if not project.scans or at(project.adjustment_path).exists():
         return nullcontext()
-    return written_judging(project.measurement_path, at(project.comparator))
+    return written_check_run(project.measurement_path, at(project.comparator))
 
 
 def adjusted_data(project: Project, at: At, most_frames: int | None = None) -> ReportData:
@@ -321,7 +321,7 @@ def adjusted_data(project: Project, at: At, most_frames: int | None = None) -> R
     return replace(data, check=check, made_from={**data.made_from, check_path.name: hash_file(check_path)})
 
 
-def with_stored_adjustment(data: ReportData, project: Project) -> ReportData:
+def note_stored_adjustment(data: ReportData, project: Project) -> ReportData:
     """Note whether adjustment.json, which the marks are shown without, is of them; nothing where there is none."""
     path = project.adjustment_path
     if not path.exists():

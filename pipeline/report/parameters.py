@@ -11,7 +11,7 @@ from adjust.functional_model.families import parameter_names
 from adjust.problem.parameter import Parameter, parameter_from_text
 from adjust.quality.significance import LEVEL
 from pipeline.report.data import ReportData
-from pipeline.report.lens import largest_effects_um, lens
+from pipeline.report.lens import largest_effects_um
 from pipeline.report.numbers import fixed, significant, value_and_sigma
 from pipeline.results.adjustment_record import CameraRecord, GivenQuantity, GroupTestRecord, Quantity
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit, pixel_intrinsics
@@ -108,14 +108,14 @@ def parameter_rows(
     """
     family, names = family_of(camera.distortion.family), parameter_names(camera.distortion.family)
     for parameter, in_mm in list(camera.interior.items())[:3]:
-        quantity, symbol = _scaled(in_mm, unit.per_mm), SYMBOLS.get(parameter, parameter)
+        quantity, symbol = _convert_unit(in_mm, unit.per_mm), SYMBOLS.get(parameter, parameter)
         meaning = _origin(quantity, prior_scale, unit)
         yield ParameterRow(symbol, unit.long_name, quantity, _given_text(quantity), "", meaning)
-    effects = largest_effects_um(lens(name, camera), radius_mm) if names else {}
+    effects = largest_effects_um(camera.lens(), radius_mm) if names else {}
     for parameter, um_per_unit in effects.items():
         known = camera.distortion.parameters.get(parameter)
         if known is not None and (known.value != 0.0 or known.sigma != 0.0):
-            effect = _scaled(known, um_per_unit * unit.per_um)
+            effect = _convert_unit(known, um_per_unit * unit.per_um)
             made = significant(effect.value, 3)
             if known.sigma > 0.0:
                 made = " ± ".join(value_and_sigma(effect.value, effect.sigma))
@@ -125,11 +125,11 @@ def parameter_rows(
 def term_rows(terms: Mapping[str, Quantity]) -> Iterator[ParameterRow]:
     """Yield rows of the terms of a scanner's geometric error, µm."""
     for name, known in terms.items():
-        in_um = _scaled(known, 1e3)
+        in_um = _convert_unit(known, 1e3)
         yield ParameterRow(name, "µm", in_um, _given_text(in_um), "", _significance(known))
 
 
-def _scaled(known: Quantity, factor: float) -> Quantity:
+def _convert_unit(known: Quantity, factor: float) -> Quantity:
     """Convert a quantity to another unit."""
     given = known.given and GivenQuantity(factor * known.given.value, factor * known.given.sigma)
     return replace(known, value=factor * known.value, sigma=factor * known.sigma, given=given)
@@ -139,7 +139,7 @@ def group_sentences(tests: Sequence[GroupTestRecord]) -> list[str]:
     """State the significance tests of groups of parameters."""
     return [
         f"{capitalised(test.group)} ({', '.join(test.parameters)}) together: "
-        + _tested(f"F = {significant(test.F, 3)}", test.p)
+        + _test_text(f"F = {significant(test.F, 3)}", test.p)
         for test in tests
     ]
 
@@ -179,14 +179,14 @@ def _given_text(quantity: Quantity) -> str:
     return f"{significant(given.value, 6)} ± {significant(given.sigma, 2)}"
 
 
-def _undetermined(sigma: float) -> str:
+def _undetermined_text(sigma: float) -> str:
     return "not determined" if math.isnan(sigma) else "held at the given value" if sigma == 0.0 else ""
 
 
 def _origin(quantity: Quantity, prior_scale: float, unit: ImageUnit) -> str:
     """State the change from the given value, and whether observations or prior determined the value."""
     given, sigma = quantity.given, quantity.sigma
-    if sentence := _undetermined(sigma):
+    if sentence := _undetermined_text(sigma):
         return sentence
     if given is None or not given.sigma > 0.0:
         return "determined by the observations alone"
@@ -202,13 +202,13 @@ def _origin(quantity: Quantity, prior_scale: float, unit: ImageUnit) -> str:
 
 
 def _significance(quantity: Quantity) -> str:
-    if sentence := _undetermined(quantity.sigma):
+    if sentence := _undetermined_text(quantity.sigma):
         return sentence
     size = abs(quantity.value) / quantity.sigma
-    return _tested(f"{size:.1f} σ" if size < 100.0 else f"{size:.0f} σ", quantity.p)
+    return _test_text(f"{size:.1f} σ" if size < 100.0 else f"{size:.0f} σ", quantity.p)
 
 
-def _tested(found: str, p: float | None) -> str:
+def _test_text(found: str, p: float | None) -> str:
     if p is None or math.isnan(p):
         return f"not tested ({found})"
     return f"{'significant' if p < LEVEL else 'not significant'} ({found}, {_p_value(p)})"

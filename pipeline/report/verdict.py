@@ -82,13 +82,13 @@ def judge(data: ReportData) -> ReportVerdict:
     shots = frames(data)
     problems = tuple(problem for found in problems_by_test(data, shots).values() for problem in found)
     is_fatal = data.adjustment is not None and any(_no_solution(data.adjustment))
-    level: Level = "failed" if is_fatal or not _observed(data, shots) else "look" if problems else "good"
+    level: Level = "failed" if is_fatal or not _observed_count(data, shots) else "look" if problems else "good"
     return ReportVerdict(level, _sentence(data, shots, level, len(problems)), problems, tuple(_notes(data, shots)))
 
 
 def problems_by_test(data: ReportData, shots: list[ReportedFrame]) -> dict[str, Iterable[ReportedProblem]]:
     """What leads to exit code 1, by the names of the tests in docs/reference/results.md."""
-    stored, check, totals, solved = data.adjustment, data.check, data.totals, _solved(data)
+    stored, check, totals, solved = data.adjustment, data.check, data.totals, _solution(data)
     unchecked = ReportedProblem(
         "Nothing checks the result: there are as many unknowns as observations.",
         "Add points or frames; until then no standard deviation here has been confirmed by the data.",
@@ -191,14 +191,14 @@ def _further_problems(adjustment: AdjustmentRecord) -> Iterator[ReportedProblem]
     yield from (ReportedProblem(f"{heading}: {contradiction(test, adjustment.cameras)}.", remedy) for test in tests)
     if not tests and (bad := _outlying(adjustment, adjustment.calibrations)):
         names = [spoken_name(row.name, adjustment.cameras) for row in bad]
-        yield ReportedProblem(f"{heading}: {_named(bad, names)}.", remedy)
+        yield ReportedProblem(f"{heading}: {_name_list(bad, names)}.", remedy)
     for group, one, many, heading, remedy, section in FURTHER:
         if bad := _outlying(adjustment, getattr(adjustment, group)):
-            what = f"{counted(len(bad), one, many)} {heading}: {_named(bad, [row.name for row in bad])}."
+            what = f"{counted(len(bad), one, many)} {heading}: {_name_list(bad, [row.name for row in bad])}."
             yield ReportedProblem(what, remedy, section=section)
 
 
-def _named(rows: Sequence[Observed], names: Sequence[str]) -> str:
+def _name_list(rows: Sequence[Observed], names: Sequence[str]) -> str:
     return listed([f"{n} (v = {row.v:.4g}, w = {fixed(row.w, 1)})" for n, row in zip(names, rows, strict=True)])
 
 
@@ -272,7 +272,7 @@ def _lens_problems(data: ReportData, solved: AdjustmentRecord) -> Iterator[Repor
 
 def lens_sentences(data: ReportData) -> Iterator[tuple[str, str, float]]:
     """Yield camera, extent of its lens in words, and the extent as a fraction of the corner radius."""
-    if solved := _solved(data):
+    if solved := _solution(data):
         for name, known in solved.estimated_lenses():
             yield name, known.sentence(name, data.unit_of_camera(name)), known.share
 
@@ -292,7 +292,7 @@ def _corners_notes(check: Check) -> Iterator[str]:
             )
 
 
-def _solved(data: ReportData) -> AdjustmentRecord | None:
+def _solution(data: ReportData) -> AdjustmentRecord | None:
     """The adjustment, if it has a solution."""
     return data.adjustment if data.adjustment and not any(_no_solution(data.adjustment)) else None
 
@@ -300,10 +300,28 @@ def _solved(data: ReportData) -> AdjustmentRecord | None:
 def _notes(data: ReportData, shots: list[ReportedFrame]) -> Iterator[str]:
     """Yield remarks that need no action."""
     yield from data.notes
+    yield from _stage_notes(data, shots)
+    if data.check:
+        yield from _corners_notes(data.check)
+    if data.adjustment:
+        yield from data.adjustment.notes
+        yield from _unmodelled_notes(data, data.adjustment)
+        yield from _weight_notes(data.adjustment)
+    if solved := _solution(data):
+        yield from _sigma0_notes(solved)
+    if data.is_film_alone:
+        yield (
+            "Fiducial marks are the same in every frame: if two scans bear each other's names, nothing here shows it."
+        )
+    yield from _mark_notes(data, shots)
+
+
+def _stage_notes(data: ReportData, shots: list[ReportedFrame]) -> Iterator[str]:
+    """Yield notes on stages without a result."""
     if not data.comparator and not data.measurement and not data.totals:
         yield "No measurement was handed to this report."
     if not data.adjustment:
-        if data.stored_adjustment == "none" and _observed(data, shots):
+        if data.stored_adjustment == "none" and _observed_count(data, shots):
             yield "These marks are not adjusted yet: run `reseau run`."
     elif not data.adjustment.converged:
         yield "There is no solution: all values and residuals of this report are those of the last iteration."
@@ -311,23 +329,21 @@ def _notes(data: ReportData, shots: list[ReportedFrame]) -> Iterator[str]:
         yield "There is no check against OpenCV yet: run `reseau check`."
     elif data.check and data.check.verdict == "not possible" and not data.is_film_alone:
         yield f"OpenCV cannot check this calibration. {data.check.reason}"
-    if data.check:
-        yield from _corners_notes(data.check)
-    if data.adjustment:
-        yield from data.adjustment.notes
-        yield from _unmodelled_notes(data, data.adjustment)
-        yield from _weight_notes(data.adjustment)
-        if (solved := _solved(data)) and not solved.has_sigma0:
-            yield A_PRIORI
-        elif solved and solved.sigma0 < (low := sigma0_bounds(solved.variance_factor.redundancy)[0]):
-            yield (
-                f"{_sigma0_and('below', low, solved.sigma0)}: the marks fit better than the standard deviations given "
-                f"({_group_sigmas(solved)}), which may be lowered."
-            )
-    if data.is_film_alone:
+
+
+def _sigma0_notes(solved: AdjustmentRecord) -> Iterator[str]:
+    """Yield the note on a sigma0 that is not estimated, or significantly small."""
+    if not solved.has_sigma0:
+        yield A_PRIORI
+    elif solved.sigma0 < (low := sigma0_bounds(solved.variance_factor.redundancy)[0]):
         yield (
-            "Fiducial marks are the same in every frame: if two scans bear each other's names, nothing here shows it."
+            f"{_sigma0_and('below', low, solved.sigma0)}: the marks fit better than the standard deviations given "
+            f"({_group_sigmas(solved)}), which may be lowered."
         )
+
+
+def _mark_notes(data: ReportData, shots: list[ReportedFrame]) -> Iterator[str]:
+    """Yield the notes on scans, and numbers of targets and tie points that were not plainly measured."""
     images_by_note: dict[str, list[str]] = {}
     for frame in shots:
         for note in frame.scan.notes if frame.scan else ():
@@ -383,7 +399,7 @@ def _weight_notes(adjustment: AdjustmentRecord) -> Iterator[str]:
 
 
 def _sentence(data: ReportData, shots: list[ReportedFrame], level: Level, problems: int) -> str:
-    marks = _observed(data, shots)
+    marks = _observed_count(data, shots)
     found = f"{counted(marks, 'mark')} in {counted(len(data.totals.marks if data.totals else shots), 'frame')}"
     ending = f", but {counted(problems, 'thing needs', 'things need')} a look." if level == "look" else "."
     if not marks:
@@ -408,7 +424,7 @@ def _sentence(data: ReportData, shots: list[ReportedFrame], level: Level, proble
     return f"Calibrated from {found}: {'; '.join(constants)}{ending}"
 
 
-def _observed(data: ReportData, shots: list[ReportedFrame]) -> int:
+def _observed_count(data: ReportData, shots: list[ReportedFrame]) -> int:
     """Number of observed marks; from the adjustment if there is no comparator file."""
     if data.totals:
         return sum(count[status] for count in data.totals.marks.values() for status in (Status.MEASURED, Status.WEAK))

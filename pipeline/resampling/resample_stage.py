@@ -126,7 +126,7 @@ class Tile(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class OpenPart:
     """An open partial scan, with its chain to the frame. inner: which of its edges (left, right, top, bottom) lie in
-    another scan; smoothing_px: see `interpolated`."""
+    another scan; smoothing_px: see `interpolate`."""
 
     source: SampleSource
     chain: frame_canvas.FrameChain
@@ -227,7 +227,7 @@ class _FrameTiles:
             for col0 in range(0, self.canvas.width_px, TILE_PX):
                 tile = self._make_tile(col0, row0)
                 self.clamped += tile.clamped
-                small = _averaged(tile.samples, self._factor)
+                small = _average_area(tile.samples, self._factor)
                 part = self._first[row0 // self._factor :, col0 // self._factor :][: small.shape[0], : small.shape[1]]
                 part[:] = small[: part.shape[0], : part.shape[1]]
                 inside = bool(tile.is_inside.flat[0])
@@ -240,7 +240,7 @@ class _FrameTiles:
         page: Samples = self._first
         for level in range(self.pages):
             yield self._factor * _REDUCTION**level, page if page.shape[2] > 1 else page[..., 0]
-            page = _averaged(page, _REDUCTION)
+            page = _average_area(page, _REDUCTION)
 
     def masks(self) -> Iterator[Mask]:
         """Yield the masks of the tiles, in their order."""
@@ -250,7 +250,7 @@ class _FrameTiles:
             yield np.pad(part, ((0, TILE_PX - part.shape[0]), (0, TILE_PX - part.shape[1])))
 
 
-def _averaged(samples: Samples, factor: int) -> Samples:
+def _average_area(samples: Samples, factor: int) -> Samples:
     height, width = (-(-side // factor) * factor for side in samples.shape[:2])
     whole = np.pad(samples, ((0, height - samples.shape[0]), (0, width - samples.shape[1]), (0, 0)), mode="edge")
     means = whole.reshape(height // factor, factor, width // factor, factor, -1).mean(axis=(1, 3))
@@ -335,7 +335,7 @@ def resample(
     tasks, results = resample_tasks(project, folder, pitch_um, with_lens, BEST if not fast else FAST)
     check_writable(folder)
     with reporter.stage("resampled frame") as count, worker_pool(max(len(tasks), 1)) as workers:
-        futures = {workers.submit(resampled, task): task for task in tasks}
+        futures = {workers.submit(resample_frame, task): task for task in tasks}
         for done, future in enumerate(as_completed(futures), 1):
             try:
                 results.append(future.result())
@@ -420,15 +420,15 @@ def _chain(
     return frame_canvas.measured_chain(measured, taking_lens) or why_not
 
 
-def resampled(task: ResampleTask) -> Resampled:
+def resample_frame(task: ResampleTask) -> Resampled:
     """Resample one scan into its file; a failure is a result, too."""
     try:
-        return _resampled(task)
+        return _resample_frame(task)
     except (MeasurementError, InputError, OSError) as error:
         return Resampled(task.image, None, problem=str(error))
 
 
-def _resampled(task: ResampleTask) -> Resampled:
+def _resample_frame(task: ResampleTask) -> Resampled:
     before = read_description(task.target)
     with ExitStack() as opened:
         scans = [(opened.enter_context(open_scan(each.scan, task.max_pixels)), each.chain) for each in task.scans]
@@ -495,7 +495,7 @@ def open_source(scan: Scan, rows_at_a_time: int, scratch: Path) -> Iterator[Samp
         yield _Decoded(scan, file.fileno())
 
 
-def interpolated(source: SampleSource, columns: Array, rows: Array, degree: Degree, smoothing_px: float = 0.0) -> Tile:
+def interpolate(source: SampleSource, columns: Array, rows: Array, degree: Degree, smoothing_px: float = 0.0) -> Tile:
     """Interpolate the scan at places (side, side) by splines of the degree; 0 outside of the scan. smoothing_px:
     standard deviation of a Gaussian filter of the scan, without which coarse steps show finer detail as coarse one."""
     shape = columns.shape
@@ -574,14 +574,14 @@ def joined_tile(
     """Tile of the frame. A pixel that is lost in the preferred scan comes from another one that has it."""
     places = [frame_canvas.scan_places(part.chain, canvas, col0, row0, side) for part in parts]
     if len(parts) == 1:
-        return interpolated(parts[0].source, *places[0], degree, parts[0].smoothing_px)
+        return interpolate(parts[0].source, *places[0], degree, parts[0].smoothing_px)
     depths = np.stack([_depth(part, *place) for part, place in zip(parts, places, strict=True)])
     result: Tile | None = None
     for k in np.argsort(-depths.reshape(len(parts), -1).max(axis=1)).tolist():
         deepest = depths[k] >= np.delete(depths, k, axis=0).max(axis=0)
         wanted = deepest if result is None else deepest | ~result.is_inside
         columns, rows = (np.where(wanted, axis, np.nan) for axis in places[k])
-        tile = interpolated(parts[k].source, columns, rows, degree, parts[k].smoothing_px)
+        tile = interpolate(parts[k].source, columns, rows, degree, parts[k].smoothing_px)
         if result is not None:
             samples = np.where(tile.is_inside[..., None], tile.samples, result.samples)
             tile = Tile(samples, result.is_inside | tile.is_inside, result.clamped + tile.clamped)

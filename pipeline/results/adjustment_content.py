@@ -9,6 +9,7 @@ from importlib.metadata import version
 import numpy as np
 from numpy.typing import NDArray
 
+from adjust.functional_model.distortion_models import UM_PER_MM
 from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import film_parameter_names
@@ -34,7 +35,6 @@ from pipeline.results.assessment_record import (
     SuspectRecord,
     TestedGiven,
 )
-from pipeline.results.image_unit import UM_PER_MM
 from pipeline.results.record_json import record_from
 from pipeline.types import Array, Indices
 
@@ -413,7 +413,7 @@ def covariance_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
     cluster_names (k), cluster_matrix (k, k) are of the interior orientations, if an unmodelled error was estimated.
     """
     whole, blocks = _parts(adjustment)
-    arrays = _named(adjustment, whole) | {"matrix": adjustment.sigma0**2 * adjustment.cofactor.part(whole)}
+    arrays = _names_and_values(adjustment, whole) | {"matrix": adjustment.sigma0**2 * adjustment.cofactor.part(whole)}
     for kind, groups in blocks.items():
         padded = np.full((len(groups), max(map(len, groups))), -1, dtype=np.intp)
         for row, group in zip(padded, groups, strict=True):
@@ -423,7 +423,7 @@ def covariance_arrays(adjustment: Adjustment) -> dict[str, NDArray[np.generic]]:
         for length in np.unique(lengths):
             cofactors = adjustment.cofactor.parts(padded[lengths == length, :length])
             matrices[lengths == length, :length, :length] = adjustment.sigma0**2 * cofactors
-        named = _named(adjustment, padded) | {"matrices": matrices}
+        named = _names_and_values(adjustment, padded) | {"matrices": matrices}
         arrays |= {f"{kind}_{name}": array for name, array in named.items()}
     keys = [key for key in adjustment.parameters if key.kind == "interior"] if adjustment.unmodelled_mm else []
     clusters = adjustment.cluster_covariance_of(keys) if keys else None
@@ -461,7 +461,7 @@ def _parts(adjustment: Adjustment) -> tuple[Indices, dict[str, list[Indices]]]:
     return whole, groups
 
 
-def _named(adjustment: Adjustment, positions: Indices) -> dict[str, NDArray[np.generic]]:
+def _names_and_values(adjustment: Adjustment, positions: Indices) -> dict[str, NDArray[np.generic]]:
     """Names and values at positions; "" and 0 at -1."""
     names = np.array([*adjustment.names, ""], dtype=np.str_)
     return {"names": names[positions], "values": np.append(adjustment.values, 0.0)[positions]}

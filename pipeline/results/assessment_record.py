@@ -7,12 +7,7 @@ from pydantic import AfterValidator, Field
 
 from pipeline.results.record_json import Flag, Number, NumberOrNone, Whole, read_parameter
 
-
-def _parameter_text(text: str) -> str:
-    return read_parameter(text).text
-
-
-ParameterText = Annotated[str, AfterValidator(_parameter_text)]  # as `Parameter.text`
+ParameterText = Annotated[str, AfterValidator(lambda text: read_parameter(text).text)]  # as `Parameter.text`
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adjust.functional_model.distortion_models import UM_PER_MM
 from pipeline.types import Array
-
-UM_PER_MM = 1000.0
 
 CENTRE = ("fx", "fy", "cx", "cy")
 

@@ -164,7 +164,7 @@ def _place_and_problem(kind: Any, error: Any) -> tuple[str, str]:
     place, at = "", kind
     way = error["loc"][:-1] if error["type"] == "missing" else error["loc"]
     for step in way:
-        at = _required(at)
+        at = _required_type(at)
         if isinstance(step, int):
             place, at = f"{place}[{step}]", get_args(at)[0]
         elif get_origin(at) is not None:
@@ -173,7 +173,7 @@ def _place_and_problem(kind: Any, error: Any) -> tuple[str, str]:
             name = next(name for name, key, _ in _fields(at) if step in (key, name))
             place = place if name == getattr(at, "rest", "") else f"{place}.{step}"
             at = get_type_hints(at, include_extras=True)[name]
-    wrong, arguments, cause = error["type"], get_args(_required(at)), error.get("ctx", {}).get("error")
+    wrong, arguments, cause = error["type"], get_args(_required_type(at)), error.get("ctx", {}).get("error")
     if cause is not None or (wrong == "missing" and isinstance(error["loc"][-1], str)):
         return place.removeprefix("."), str(cause or f"has no key {error['loc'][-1]!r}")
     expected = _EXPECTED.get(wrong, error["msg"])
@@ -185,7 +185,7 @@ def _place_and_problem(kind: Any, error: Any) -> tuple[str, str]:
     return place.removeprefix("."), _wrong(error["input"], expected + null)
 
 
-def _required(kind: Any) -> Any:
+def _required_type(kind: Any) -> Any:
     """Type without annotations and without None."""
     while get_origin(kind) is Annotated or NoneType in get_args(kind):
         kind = next(each for each in get_args(kind) if each is not NoneType)

@@ -291,9 +291,9 @@ class DrawingAnswers:
             known = replace(project, pitch_um=placement.pitch_um, pose="auto")
             clicks = Clicks(drawing.image, {one.id: one.px for one in drawing.marks}, who=self._session.who)
             learned = camera_as_shown(known, camera, clicks)
-            return self._saved(camera_drawing.save_learned(learned, drawing.image, path))
+            return self._save_message(camera_drawing.save_learned(learned, drawing.image, path))
         scan = self._session.scan_location(drawing.image)
-        return self._saved(
+        return self._save_message(
             self._pictures.compute(scan, lambda file: camera_drawing.save_drawing(drawing, placement, file, path))
         )
 
@@ -305,9 +305,9 @@ class DrawingAnswers:
         camera = project.image_camera(given.image)
         check_clicks(camera, given.image, given.px)
         learned = camera_as_shown(project, camera, Clicks(given.image, given.px, who=self._session.who))
-        return self._saved(camera_drawing.save_learned(learned, given.image, path))
+        return self._save_message(camera_drawing.save_learned(learned, given.image, path))
 
-    def _saved(self, camera: CameraFile) -> Any:
+    def _save_message(self, camera: CameraFile) -> Any:
         file, project = camera.path.name, self._session.project
         names = {project.missing_camera, *(one.path.name for one in project.cameras.values())}
         first = "" if file in names else f'name it in the project, camera = "{file}", then '
@@ -350,7 +350,7 @@ def handles(mark: MarkJson, toward: Point = (1.0, 1.0)) -> Iterator[Handle]:
         yield _length(mark, "line_mm", angle + 90.0, 2.0, side=(start + end) / 2)
     if "size_mm" in mark:
         half, key = mark["size_mm"] / 2, "size_mm"
-        yield Handle(key, (half, half), lambda place: _changed(mark, key, max(2 * np.abs(place).max(), _LEAST_MM)))
+        yield Handle(key, (half, half), lambda place: _with_value(mark, key, max(2 * np.abs(place).max(), _LEAST_MM)))
     for at, vertex in enumerate(mark.get("vertices_mm", ())):
         yield Handle(
             f"vertices_mm.{at}",
@@ -446,22 +446,22 @@ def _length(
 
     def dragged(place: Array) -> MarkJson:
         value = factor * (float(along @ (place - start)) - offset)
-        return _changed(mark, key, max(value, 0.0 if key in ("gap_mm", "reach_mm") else _LEAST_MM))
+        return _with_value(mark, key, max(value, 0.0 if key in ("gap_mm", "reach_mm") else _LEAST_MM))
 
     return Handle(key, camera_drawing.as_point(start + along * (offset + mark.get(key, 0.0) / factor)), dragged)
 
 
 def _place(mark: MarkJson, key: str) -> Handle:
-    return Handle(key, camera_drawing.as_point(mark[key]), lambda place: _changed(mark, key, place.tolist()))
+    return Handle(key, camera_drawing.as_point(mark[key]), lambda place: _with_value(mark, key, place.tolist()))
 
 
-def _changed(mark: MarkJson, key: str, value: Any) -> MarkJson:
+def _with_value(mark: MarkJson, key: str, value: Any) -> MarkJson:
     return scaled_mark({**mark, key: value})
 
 
 def _drag_item(mark: MarkJson, key: str, at: int, dragged: Callable[[Array], Any], place: Array) -> MarkJson:
     """Mark with an item of a list dragged to a place."""
-    return _changed(mark, key, [*mark[key][:at], dragged(place), *mark[key][at + 1 :]])
+    return _with_value(mark, key, [*mark[key][:at], dragged(place), *mark[key][at + 1 :]])
 
 
 def _cross(mark: MarkJson) -> Iterator[Handle]:

@@ -183,7 +183,7 @@ def measured_from_clicks(project: Project, image: str, clicks: Sequence[Click]) 
     if unknown:
         raise InputError(f"{image}: its camera has no mark {', '.join(unknown)}.")
     (task,) = scan_tasks(project, [image])
-    return _tried(task.changed(clicks=tuple(clicks)))
+    return _try_measurement(task.with_options(clicks=tuple(clicks)))
 
 
 def measured_as_shown(project: Project, shown: str, px: Mapping[str, tuple[float, float]], image: str) -> MeasuredScan:
@@ -195,7 +195,7 @@ def measured_as_shown(project: Project, shown: str, px: Mapping[str, tuple[float
     check_clicks(camera, shown, px)
     start = camera_as_shown(project, camera, Clicks(shown, px))
     own = {name: start if one.path == camera.path else one for name, one in project.cameras.items()}
-    return _tried(scan_tasks(replace(project, cameras=own), [image])[0])
+    return _try_measurement(scan_tasks(replace(project, cameras=own), [image])[0])
 
 
 def check_clicks(camera: CameraFile, image: str, px: Mapping[str, object]) -> None:
@@ -211,6 +211,6 @@ def camera_as_shown(project: Project, camera: CameraFile, clicks: Clicks) -> Cam
     return first_pictures(replace(camera, clicks=clicks), [task.fiducials_alone("linear")], None)
 
 
-def _tried(task: ScanTask) -> MeasuredScan:
-    task = task.changed(writing="none")
+def _try_measurement(task: ScanTask) -> MeasuredScan:
+    task = task.with_options(writing="none")
     return measured_scan(replace(task, options=replace(task.options, targets=None, exterior=None)))

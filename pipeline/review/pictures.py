@@ -64,11 +64,11 @@ class Pictures:
 
     def frame(self, scan: str) -> bytes:
         """Whole scan, reduced."""
-        return self._png(lambda: stretched(self._reduced(scan, _FRAME_PX)))
+        return self._png(lambda: to_8_bits(self._reduced(scan, _FRAME_PX)))
 
-    def posed(self, scan: str, pose: str) -> bytes:
+    def upright(self, scan: str, pose: str) -> bytes:
         """Whole scan rotated and mirrored back from a scan orientation (pose): upright if that pose is right."""
-        return self._png(lambda: upright(stretched(self._reduced(scan, _POSE_PX)), pose))
+        return self._png(lambda: upright(to_8_bits(self._reduced(scan, _POSE_PX)), pose))
 
     def _reduced(self, name: str, side_px: int) -> Array:
         scan = self._scan(name)
@@ -92,7 +92,7 @@ class Pictures:
         return self._open[name]
 
 
-def stretched(grey: Array) -> NDArray[np.uint8]:
+def to_8_bits(grey: Array) -> NDArray[np.uint8]:
     """Stretch grey values to 8 bits between their extreme percentiles."""
     return np.asarray(np.rint(stretch(grey)), dtype=np.uint8)
 
@@ -108,7 +108,7 @@ def _window(scan: Scan, col0: int, row0: int, size: int) -> NDArray[np.uint8]:
         raise MeasurementError("the window is outside of the scan")
     step = max(1, size // _WINDOW_PX)
     if step == 1:
-        shown = stretched(np.asarray(scan.window(col0, row0, size, size), dtype=np.float64))
+        shown = to_8_bits(np.asarray(scan.window(col0, row0, size, size), dtype=np.float64))
         shown[~scan.inside(col0, row0, size, size)] = _NOTHING
         return shown
     # Means over squares of step x step pixels, read within the scan, one row of means at a time.
@@ -120,7 +120,7 @@ def _window(scan: Scan, col0: int, row0: int, size: int) -> NDArray[np.uint8]:
         starts = ((col0 + step * cols.start, row0 + step * row) for row in rows)
         bands = (scan.window(*start, len(cols) * step, step).reshape(step, len(cols), step) for start in starts)
         means = [np.asarray(band.mean(axis=(0, 2), dtype=np.float64)) for band in bands]
-        shown[rows.start : rows.stop, cols.start : cols.stop] = stretched(np.stack(means))
+        shown[rows.start : rows.stop, cols.start : cols.stop] = to_8_bits(np.stack(means))
     return shown
 
 

@@ -90,21 +90,21 @@ class Guard:
         """Response to an unauthorised request, or the redirect that sets the cookie; None for an authorised request."""
         host, origin = request.headers.get("host", ""), request.headers.get("origin")
         if host not in self._hosts:
-            return _refused(f"This server answers to {self._hosts[0]} only.\n")
+            return _refuse(f"This server answers to {self._hosts[0]} only.\n")
         needs_origin = request.method not in ("GET", "HEAD")
         if origin != f"http://{host}" and (origin is not None or needs_origin):
-            return _refused("Only the page itself may ask this.\n")
+            return _refuse("Only the page itself may ask this.\n")
         if request.url.path == "/" and (given := request.query_params.get("token", "")):
             if not hmac.compare_digest(given.encode(), self._token.encode()):
-                return _refused(_SPENT)
+                return _refuse(_SPENT)
             answer = RedirectResponse("/", status_code=303)  # a cookie in place of the token, which others could read
             answer.set_cookie(self._cookie, self._secret, httponly=True, samesite="strict")
             return answer
         own = request.cookies.get(self._cookie, "")
-        return None if hmac.compare_digest(own.encode(), self._secret.encode()) else _refused(_SPENT)
+        return None if hmac.compare_digest(own.encode(), self._secret.encode()) else _refuse(_SPENT)
 
 
-def _refused(text: str) -> Response:
+def _refuse(text: str) -> Response:
     return PlainTextResponse(text, status_code=403)
 
 
@@ -272,7 +272,7 @@ class _Answers:
         pose = query.get("pose", "")
         if pose not in POSES:
             raise KeyError(pose)
-        return self._pictures.posed(self._scan(query), pose)
+        return self._pictures.upright(self._scan(query), pose)
 
     def decide(self, query: Query, body: Any) -> Any:
         given = parse_values(Decide, body)

@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 
 from measure.flags import Code, Status
 from measure.scans.remote import fetch_location
-from pipeline.archive.checked_results import Judging, latest
-from pipeline.archive.results_database import Store
-from pipeline.archive.schema import DamagedError, check_judging, damaged_frames, damaged_result
+from pipeline.archive.checked_results import CheckRun, latest
+from pipeline.archive.results_database import ResultsDatabase
+from pipeline.archive.schema import DamagedError, damaged_frames, damaged_result, verify_check_run
 from pipeline.archive.verdicts import Verdict
 from pipeline.errors import InputError
 from pipeline.files import decisions_file
@@ -98,13 +98,13 @@ class Entry:
         return self.images[0].rpartition("/")[0]
 
 
-def build_queue(project: Project, db: sqlite3.Connection | None, judging: int) -> tuple[Entry, ...]:
+def build_queue(project: Project, db: sqlite3.Connection | None, check_run: int) -> tuple[Entry, ...]:
     """Build the queue of one run of the cross-scan checks, the worst first. db: None before the first run."""
     if db:
-        check_judging(db, judging, project.measurement_path)
-    damaged = damaged_frames(db, judging) if db else {}
-    frames = {frame.result: frame for frame in _frames(db, judging) if frame.result not in damaged} if db else {}
-    marks = sorted(_marks(db, judging, frames), key=_badness) if db else []
+        verify_check_run(db, check_run, project.measurement_path)
+    damaged = damaged_frames(db, check_run) if db else {}
+    frames = {frame.result: frame for frame in _frames(db, check_run) if frame.result not in damaged} if db else {}
+    marks = sorted(_marks(db, check_run, frames), key=_badness) if db else []
     bare = [
         Entry(Question.FRAME, (image,), ("",), "", str(Verdict.FAILED), 0, str(damaged_result(image, name)))
         for name in [project.measurement_path.name]
@@ -166,9 +166,9 @@ order by abs(f.scan - own.scan) limit ?5
 """
 
 
-def _frames(db: sqlite3.Connection, judging: int) -> Iterator[_Frame]:
-    found: dict[int, int] = dict(db.execute(_FOUND, (judging,)).fetchall())
-    for *frame, pose_json in db.execute(_FRAMES, (judging,)):
+def _frames(db: sqlite3.Connection, check_run: int) -> Iterator[_Frame]:
+    found: dict[int, int] = dict(db.execute(_FOUND, (check_run,)).fetchall())
+    for *frame, pose_json in db.execute(_FRAMES, (check_run,)):
         pose = json.loads(pose_json or "null") or {"name": "", "decided": True, "evidence": [], "roll": ""}
         orientation = pose["name"], bool(pose["decided"]), " ".join(pose["evidence"]), pose["roll"]
         yield _Frame._make((*frame, found.get(frame[1], 0), *orientation))
@@ -196,8 +196,8 @@ def _poses(frames: Sequence[_Frame]) -> Iterator[Entry]:
         yield Entry(Question.POSE, images, keys, first.camera, first.verdict, first.marks, reason)
 
 
-def _marks(db: sqlite3.Connection, judging: int, frames: dict[int, _Frame]) -> Iterator[Entry]:
-    for result, point, kind, status, code, reason in db.execute(_MARKS, (judging,)):
+def _marks(db: sqlite3.Connection, check_run: int, frames: dict[int, _Frame]) -> Iterator[Entry]:
+    for result, point, kind, status, code, reason in db.execute(_MARKS, (check_run,)):
         frame = frames.get(result)
         if frame is not None and frame.marks:
             where = ((frame.image,), (frame.key,), frame.camera, frame.verdict, frame.marks)
@@ -239,16 +239,16 @@ class Session:
         self.project = self.learned = project  # learned: with the marks that its scans have in common
         self.who = who
         self.folder = project.path.resolve().parent
-        if project.missing_camera and self._latest_judging() is not None:
+        if project.missing_camera and self._latest_check_run() is not None:
             raise InputError(
                 f"{self.folder / project.missing_camera}: there is no such file, but its marks are in "
                 f"{project.measurement_path}. Put the file back; or delete that database, and draw the camera."
             )
         self._lock = threading.RLock()
-        self._judging: int | None = None
+        self._check_run: int | None = None
         self._file_state: FileState | None = None  # of the decisions when they were read
         self.refresh()
-        if self._judging == _NONE and not self._by_key and not project.scans:
+        if self._check_run == _NONE and not self._by_key and not project.scans:
             raise InputError(
                 f"{project.measurement_path}: no scan in it passed the cross-scan checks. Run `reseau measure` first."
             )
@@ -256,27 +256,27 @@ class Session:
     def refresh(self) -> None:
         """Update the queue and its answers from the results database and the decisions file."""
         with self._lock:
-            judging = self._latest_judging()
-            row = _NONE if judging is None else judging.row
+            check_run = self._latest_check_run()
+            row = _NONE if check_run is None else check_run.row
             path = self.project.decisions_path
             before, self._file_state = self._file_state, file_state(path, self.folder)
-            if row == self._judging and self._file_state == before:
+            if row == self._check_run and self._file_state == before:
                 return
-            if row != self._judging:
+            if row != self._check_run:
                 self.project = self.learned = reload_decisions(self.project)
                 if row == _NONE:
                     queue = build_queue(self.project, None, row)
                 else:
-                    with Store(self.project.measurement_path) as store:
-                        self.learned = add_learned_marks(self.project, store)
-                        queue = build_queue(self.project, store.connection, row)
-                self._by_key, self._judging = {entry.key: entry for entry in queue}, row
+                    with ResultsDatabase(self.project.measurement_path) as database:
+                        self.learned = add_learned_marks(self.project, database)
+                        queue = build_queue(self.project, database.connection, row)
+                self._by_key, self._check_run = {entry.key: entry for entry in queue}, row
             decisions = decisions_file.read_decisions(path)
             self._standing = decisions_file.standing(decisions)
             self._later_keys = dict[str, set[str]]()
             if row != _NONE:
-                with Store(self.project.measurement_path) as store:
-                    self._later_keys = {key: store.later_keys(key) for key in {one.fingerprint for one in decisions}}
+                with ResultsDatabase(self.project.measurement_path) as database:
+                    self._later_keys = {key: database.later_keys(key) for key in {one.fingerprint for one in decisions}}
             self._learned = [one for one in decisions if one.subject[2] == decisions_file.LEARNED]
             self._of_image = defaultdict[str, list[decisions_file.Decision]](list)
             for one in self._standing.values():
@@ -311,7 +311,7 @@ class Session:
             open_places = [at for at, (key, entry) in enumerate(shown.items()) if self._is_open(key, entry)]
             left = Counter(entry.question for key, entry in self._by_key.items() if self._is_open(key, entry))
             return {
-                "judging": self._judging,
+                "judging": self._check_run,
                 "total": sum(entry.is_left for entry in self._by_key.values()),
                 "left": {"all": left.total(), **{str(question): left[question] for question in Question}},
                 "optional": sum(not entry.is_left for entry in self._by_key.values()),
@@ -365,28 +365,30 @@ class Session:
 
         Raises KeyError for an image without checked results, DamagedError for a damaged result.
         """
-        with Store(self.project.measurement_path) as store:
-            judging = latest(store)
-            row = store.connection.execute(_CHECKED, (image, _NONE if judging is None else judging.row)).fetchone()
-            if row is None or judging is None:
+        with ResultsDatabase(self.project.measurement_path) as database:
+            check_run = latest(database)
+            row = database.connection.execute(
+                _CHECKED, (image, _NONE if check_run is None else check_run.row)
+            ).fetchone()
+            if row is None or check_run is None:
                 raise KeyError(image)
-            (scan,) = judging.scans({image})
+            (scan,) = check_run.scans({image})
         if scan.failure and scan.failure.code is FailureCode.DAMAGED:
             raise DamagedError(scan.failure.sentence)
         return ReviewFrame(scan, str(row[0]), str(row[1]), self.learned.image_camera(image))
 
     def similar_frames(self, image: str, point: str, kind: str) -> list[str]:
         """Frames for comparison: nearby frames of the same camera in which the mark was measured."""
-        with Store(self.project.measurement_path) as store:
-            rows = store.connection.execute(_NEARBY, (image, _NEAR, point, kind, _OTHERS)).fetchall()
+        with ResultsDatabase(self.project.measurement_path) as database:
+            rows = database.connection.execute(_NEARBY, (image, _NEAR, point, kind, _OTHERS)).fetchall()
         return [name for (name,) in rows]
 
-    def _latest_judging(self) -> Judging | None:
+    def _latest_check_run(self) -> CheckRun | None:
         path = self.project.measurement_path
         if not path.exists():
             return None
-        with Store(path) as store:
-            return latest(store)
+        with ResultsDatabase(path) as database:
+            return latest(database)
 
     def scan_location(self, image: str) -> str:
         """Path or address of an image's file. Raises KeyError for an unknown image."""

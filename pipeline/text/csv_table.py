@@ -12,16 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import InputError
-from pipeline.text.files import (
-    LARGEST,
-    MOST_MB,
-    SMALLEST_SIGMA,
-    FilePath,
-    no_such_file,
-    quote_value,
-    read_bytes,
-    split_lines,
-)
+from pipeline.text import files
 from pipeline.text.wording import did_you_mean
 
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
@@ -54,7 +45,7 @@ class Row:
             raise self.error(column, "is empty; every line needs it.")
         if len(value) > _LONGEST_NAME or any(unicodedata.category(letter) in ("Cc", "Cs") for letter in value):
             raise self.error(
-                column, f"{quote_value(value)} is not a valid name: at most {_LONGEST_NAME} printable characters."
+                column, f"{files.quote_value(value)} is not a valid name: at most {_LONGEST_NAME} printable characters."
             )
         return value
 
@@ -67,12 +58,14 @@ class Row:
             number = float(value)
         except ValueError:
             raise self.error(
-                column, f"must be a number with a decimal point or blank, not {quote_value(value)}."
+                column, f"must be a number with a decimal point or blank, not {files.quote_value(value)}."
             ) from None
         if not math.isfinite(number):
-            raise self.error(column, f"must be a finite number or blank, not {quote_value(value)}.")
-        if abs(number) > LARGEST:
-            raise self.error(column, f"{quote_value(value)} is larger than anything that is measured. Correct it.")
+            raise self.error(column, f"must be a finite number or blank, not {files.quote_value(value)}.")
+        if abs(number) > files.LARGEST:
+            raise self.error(
+                column, f"{files.quote_value(value)} is larger than anything that is measured. Correct it."
+            )
         return number
 
     def sigma(self, column: str) -> float | None:
@@ -80,7 +73,7 @@ class Row:
         sigma = self.number(column)
         if sigma is not None and sigma < 0.0:
             raise self.error(column, f"is a standard deviation and cannot be negative ({sigma:g}).")
-        if sigma is not None and 0.0 < sigma < SMALLEST_SIGMA:
+        if sigma is not None and 0.0 < sigma < files.SMALLEST_SIGMA:
             raise self.error(column, f"a standard deviation of {sigma:g} is too small. Write 0 to fix the value.")
         return sigma
 
@@ -97,15 +90,15 @@ def csv_line(cells: Sequence[str]) -> str:
 
 
 def read_csv(
-    path: FilePath, required: Sequence[str], optional: Sequence[str] = (), most_mb: int = MOST_MB
+    path: files.FilePath, required: Sequence[str], optional: Sequence[str] = (), most_mb: int = files.MOST_MB
 ) -> Iterator[Row]:
     """Yield the rows of a CSV file. Raises InputError for a missing file, a missing or unknown column, or an incomplete
     line."""
     path = Path(path)
     try:
-        lines = enumerate(split_lines(read_bytes(path, most_mb).decode("utf-8-sig")), 1)
+        lines = enumerate(files.split_lines(files.read_bytes(path, most_mb).decode("utf-8-sig")), 1)
     except FileNotFoundError:
-        raise InputError(no_such_file(path)) from None
+        raise InputError(files.no_such_file(path)) from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; a CSV file is needed here. Name one.") from None
     except UnicodeDecodeError:
@@ -164,8 +157,9 @@ def _check_header(
         if column and column not in known:
             hint = did_you_mean(column, known)
             raise InputError(
-                f"{path}, line {line}: {quote_value(column)} is no column of this file.{hint} Known: {','.join(known)}."
+                f"{path}, line {line}: {files.quote_value(column)} is no column of this file.{hint} Known: "
+                f"{','.join(known)}."
             )
     twice = [column for column in header if header.count(column) > 1]
     if twice:
-        raise InputError(f"{path}, line {line}: the column {quote_value(twice[0])} is named twice.")
+        raise InputError(f"{path}, line {line}: the column {files.quote_value(twice[0])} is named twice.")

@@ -109,10 +109,10 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _temporary_file(temporary: Path, told: Path) -> Iterator[Path]:
-    """Temporary file, in a folder created if necessary; removed at the end. told: path named in a WriteError."""
+def _temporary_file(temporary: Path, path: Path) -> Iterator[Path]:
+    """Temporary file, in a folder created if necessary; removed at the end. path: named in a WriteError."""
     try:
-        with writing(told):
+        with writing(path):
             temporary.parent.mkdir(parents=True, exist_ok=True)
             yield temporary
     finally:
@@ -121,7 +121,7 @@ def _temporary_file(temporary: Path, told: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def writing(told: Path) -> Iterator[None]:
+def writing(path: Path) -> Iterator[None]:
     """Convert errors of the operating system in the block to a WriteError that names the file."""
     try:
         yield
@@ -129,11 +129,11 @@ def writing(told: Path) -> Iterator[None]:
         named = Path(error.filename)
         file = next(each for each in (named, *named.parents) if each.exists())
         raise WriteError(
-            f"{told}: cannot be written: {file} is a file, and a folder is needed there. Name another folder."
+            f"{path}: cannot be written: {file} is a file, and a folder is needed there. Name another folder."
         ) from error
     except OSError as error:
         raise WriteError(
-            f"{told}: cannot be written ({error.strerror or error}). Nothing was changed there. {what_to_do(error)}"
+            f"{path}: cannot be written ({error.strerror or error}). Nothing was changed there. {what_to_do(error)}"
         ) from error
 
 

@@ -60,11 +60,11 @@ def drop_file_name(sentence: str, file: str) -> str:
     return rest if found and ": " not in head else sentence
 
 
-def gathered(told: Iterable[tuple[str, str, str]]) -> list[str]:
-    """Merge equal messages of images. told: image, file and message; returns one sentence for each different message,
-    with the number of scans if there are several."""
+def gathered(messages: Iterable[tuple[str, str, str]]) -> list[str]:
+    """Merge equal messages of images, given as image, file and message; returns one sentence for each different
+    message, with the number of scans if there are several."""
     alike: dict[str, list[tuple[str, str]]] = {}
-    for image, file, sentence in told:
+    for image, file, sentence in messages:
         alike.setdefault(drop_file_name(sentence, file), []).append((image, sentence))
     return [
         f"{len(own)} scans ({listed([image for image, _ in own])}): {same}" if len(own) > 1 else own[0][1]

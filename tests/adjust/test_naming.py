@@ -47,7 +47,7 @@ def test_a_fifth_missing_and_a_fifth_false(points: int, depth: float) -> None:
     assert isinstance(names, Names), names
     assert all(point[mark] == own for own, mark in names.mark.items())
     assert len(names.mark) >= 0.9 * (point >= 0).sum()
-    assert names.log10_chance < -10.0
+    assert names.log10_false_alarms < -10.0
 
 
 @pytest.mark.study

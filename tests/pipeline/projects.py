@@ -21,8 +21,8 @@ from adjust import Network, Prior
 from measure import FiducialLayout
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
-from pipeline.archive.checked_results import CheckedResult, find_judging, judge
-from pipeline.archive.results_database import Kept, Store
+from pipeline.archive.checked_results import CheckedResult, find_check_run, store_checks
+from pipeline.archive.results_database import Kept, ResultsDatabase
 from pipeline.cli import DONE, LOOK, run
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_measurement import measured_scan
@@ -293,22 +293,22 @@ def content(scan: MeasuredScan) -> tuple[object, ...]:
     return (scan.frame.image, scan_detail(scan, scan.scan), codes, *map(mark_row, scan.frame.marks))
 
 
-def stored(store: Store, row: int, image: str = "1") -> tuple[object, ...]:
+def stored(database: ResultsDatabase, row: int, image: str = "1") -> tuple[object, ...]:
     """The content of a result of a store."""
-    return content(store.scan(row, image, FOLDER))
+    return content(database.scan(row, image, FOLDER))
 
 
 def keep_scans(path: Path, scans: Sequence[MeasuredScan], made_from: Mapping[str, str] | None = None) -> str:
     """In the store at `path` of the project whose folder is above its own; the digest of their judging."""
     folder = path.parent.parent.resolve()
-    with Store(path) as store:
-        store.set_project_folder(folder)
+    with ResultsDatabase(path) as database:
+        database.set_project_folder(folder)
         frames = []
         for scan in scans:
             identity = FileIdentity(file_state(Path(scan.scan), folder), parts_hash(Path(scan.scan)))
-            row = store.keep(Kept(identity, "{}", scan), scan.frame.image)
+            row = database.keep(Kept(identity, "{}", scan), scan.frame.image)
             frames.append(CheckedResult(row, scan))
-        return judge(store, made_from or {}, "kept", frames).digest
+        return store_checks(database, made_from or {}, "kept", frames).digest
 
 
 def comparator_points(
@@ -334,11 +334,11 @@ def scan_content(file: Path) -> bytes:
     if file.suffix != ".db":
         return file.read_bytes()
     comparator = file.parents[1] / "comparator.csv"
-    with Store(file) as store:
-        judging = find_judging(store, read_measurement_hash(comparator)) if comparator.exists() else None
-        scans = () if judging is None else judging.scans()
+    with ResultsDatabase(file) as database:
+        check_run = find_check_run(database, read_measurement_hash(comparator)) if comparator.exists() else None
+        scans = () if check_run is None else check_run.scans()
         kept = [[scan_detail(scan, ""), *map(mark_row, scan.frame.marks)] for scan in scans]
-        return b"" if judging is None else repr([judging.digest, *kept]).encode()
+        return b"" if check_run is None else repr([check_run.digest, *kept]).encode()
 
 
 def measure_scan(project: Project, name: str) -> MeasuredScan:

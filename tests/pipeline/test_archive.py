@@ -25,8 +25,8 @@ from measure.fiducials.options import BelievedFilm
 from pipeline import read_measurement, read_project
 from pipeline.archive.checked_results import latest
 from pipeline.archive.made_from import differing, measured_from
-from pipeline.archive.results_database import Store
-from pipeline.archive.schema import MEASUREMENTS, Schema, opened
+from pipeline.archive.results_database import ResultsDatabase
+from pipeline.archive.schema import MEASUREMENTS, Schema, open_database
 from pipeline.archive.status import archive_status
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_doubt
 from pipeline.files.camera_file import CameraFile
@@ -125,8 +125,8 @@ def test_exactly_what_changed_is_measured_again(folder: Path, change: str) -> No
 
 def test_decisions_stay_with_results_of_touched_files(folder: Path) -> None:
     """Touched, touched again, and as old as at first; what a decision names is found in the review, too."""
-    with Store(folder / "out" / "measurement.db") as store:
-        key = store.first("select fingerprint from result join scan on scan.id = scan where name = 'b'")
+    with ResultsDatabase(folder / "out" / "measurement.db") as database:
+        key = database.first("select fingerprint from result join scan on scan.id = scan where name = 'b'")
     point = next(line.split(",")[1] for line in marks(folder).decode().splitlines() if line.startswith("b,"))
     line = {"image": "b", "decision": "reject", "point": point, "fingerprint": key}
     (folder / "decisions.jsonl").write_text(json.dumps(line) + "\n")
@@ -138,22 +138,22 @@ def test_decisions_stay_with_results_of_touched_files(folder: Path) -> None:
         (row,) = (row for row in marks(folder).decode().splitlines() if row.startswith(f"b,{point},"))
         assert ",rejected," in row
         project = read_project(folder / "project.toml")
-        with Store(project.measurement_path) as store:
-            now = store.first("select fingerprint from result join scan on scan.id = scan where name = 'b'")
+        with ResultsDatabase(project.measurement_path) as database:
+            now = database.first("select fingerprint from result join scan on scan.id = scan where name = 'b'")
         assert (now == key) is (time_ns == first_ns)
         assert Session(project, "me")._names_result(project.decisions[0], now)
 
 
 def test_measure_keeps_a_second_pass_until_the_adjustment_has_other_settings(folder: Path) -> None:
     before, path = marks(folder), folder / "out" / "measurement.db"
-    with Store(path) as store:
-        judging = present(latest(store))
+    with ResultsDatabase(path) as database:
+        check_run = present(latest(database))
         scans = [
             scan.changed([replace(mark, point=f"{mark.point}'") for mark in scan.frame.marks])
-            for scan in judging.scans()
+            for scan in check_run.scans()
         ]
         for _ in range(2):  # of a second pass another one
-            judging = judging.rejudge(scans, read_project(folder / "project.toml").adjust)
+            check_run = check_run.store_second_pass(scans, read_project(folder / "project.toml").adjust)
     for _ in range(2):
         assert measure(folder) in (0, 1)
         assert marks(folder).count(b"',") == len(scans[0].frame.marks) * 3
@@ -172,11 +172,11 @@ def test_film_settings_of_the_adjustment_are_settings_of_the_measurement(folder:
 
 def test_a_second_measure_waits_for_no_other(folder: Path, refusal: Refusal) -> None:
     """In another process; a killed one leaves nothing behind."""
-    store = folder / "out" / "measurement.db"
+    database = folder / "out" / "measurement.db"
     code = (
         "import pathlib, time\n"
         "from pipeline.archive.schema import single_writer\n"
-        f"with single_writer(pathlib.Path({str(store)!r})):\n"
+        f"with single_writer(pathlib.Path({str(database)!r})):\n"
         "    print('has it', flush=True)\n"
         "    time.sleep(100)"
     )
@@ -186,12 +186,12 @@ def test_a_second_measure_waits_for_no_other(folder: Path, refusal: Refusal) -> 
             for command in ("measure", "run"):
                 sentence = refusal(command, folder / "project.toml")
                 assert "another `reseau measure` or `reseau run` is running on this project" in sentence
-            with Store(store) as reader:
+            with ResultsDatabase(database) as reader:
                 assert latest(reader) is not None
         finally:
             other.kill()
     assert measure(folder) in (0, 1)
-    assert not list(store.parent.glob(".*"))
+    assert not list(database.parent.glob(".*"))
 
 
 def test_results_come_back_by_options_and_move_with_their_project(folder: Path, tmp_path: Path) -> None:
@@ -284,12 +284,12 @@ def test_a_full_disk_costs_no_result(folder: Path, monkeypatch: pytest.MonkeyPat
     one_more(folder)
 
     def full(path: Path, schema: Schema = MEASUREMENTS) -> sqlite3.Connection:
-        store = opened(path, schema)
-        store.execute("pragma max_page_count = 1")  # no page more than there are
-        return store
+        database = open_database(path, schema)
+        database.execute("pragma max_page_count = 1")  # no page more than there are
+        return database
 
     with monkeypatch.context() as patched:
-        patched.setattr("pipeline.archive.schema.opened", full)
+        patched.setattr("pipeline.archive.schema.open_database", full)
         assert measure(folder) == 2
     message = capsys.readouterr().err
     assert "is full). Make room there" in message
@@ -308,12 +308,12 @@ def test_shards_joined_are_the_same_as_one_machine(
     project = parts / "project.toml"
     assert measure(parts, "--shard", "1/5") == 0
     assert not (parts / "comparator.csv").exists()
-    store = parts / "out" / "measurement.{}-of-5.db"
-    assert projects.command("merge", project, str(store).format(1)) == 1  # the others are waiting
+    database = parts / "out" / "measurement.{}-of-5.db"
+    assert projects.command("merge", project, str(database).format(1)) == 1  # the others are waiting
     assert "waiting" in capsys.readouterr().out
     assert measure(parts, "--shard", "2/5") == 0
     assert sorted(measured) == ["a", "b", "c"]
-    assert projects.command("merge", project, *(str(store).format(k) for k in (1, 2))) == 0
+    assert projects.command("merge", project, *(str(database).format(k) for k in (1, 2))) == 0
     assert len(measured) == 3
     assert marks(parts) == marks(folder)
     assert measure(parts) == 0
@@ -363,7 +363,7 @@ def test_status_tells_what_changed_outside(folder: Path, printed: projects.Print
 def test_status_says_why_a_scan_needs_attention(folder: Path) -> None:
     scan, *_ = read_measurement(folder / "out" / "measurement.db")
     assumed = replace(scan, frame=replace(scan.frame, pose=ScanOrientation("90", decided=False)))
-    doubted = scan.restated("fiducial", Status.WEAK, Reason("it is dusty", Code.DUST))
+    doubted = scan.with_status("fiducial", Status.WEAK, Reason("it is dusty", Code.DUST))
     assert scan_doubt(scan) == ""
     assert scan_doubt(assumed) == "scan orientation 90 is assumed"
     assert scan_doubt(assumed.changed(problems=[Reason("it is bent", Code.PITCH)])) == "it is bent"

@@ -13,7 +13,7 @@ from projects import Capture, Printed, Refusal, command, fiducial_tables, presen
 
 from pipeline import InputError
 from pipeline.cli import DONE, WRONG_INPUT
-from pipeline.design.expected import alone, alternatives, expect, rms
+from pipeline.design.expected import alternatives, expect, rms, sigmas_of_images_alone
 from pipeline.design.setup import planned_network, scene_setup
 from pipeline.design.sweeps import Variations, sweep
 from pipeline.rendered.scene_file import read_scene
@@ -152,19 +152,19 @@ def test_the_network_is_what_the_frames_show(tmp_path: Path) -> None:
     ],
 )
 def test_quantities_vary(tmp_path: Path, quantity: str, value: float, found: Callable[[object], float]) -> None:
-    varied = Variations.read(small(tmp_path)).varied(1, Sweep(quantity=quantity, values=(value, 99)), value)
+    varied = Variations.read(small(tmp_path)).with_value(1, Sweep(quantity=quantity, values=(value, 99)), value)
     assert found(varied.setup()) == pytest.approx(value)
 
 
 def test_points_and_cameras_of_other_files_can_be_varied_and_natural_points_not(tmp_path: Path) -> None:
-    setup = Variations.read(small(tmp_path)).varied(1, Sweep(quantity="field.points", values=(100, 1)), 100).setup()
+    setup = Variations.read(small(tmp_path)).with_value(1, Sweep(quantity="field.points", values=(100, 1)), 100).setup()
     assert np.ptp([point.xyz[:2] for point in setup.points], axis=0) == pytest.approx([4.0 * 9 / 10] * 2)
     sweep = Sweep(quantity="camera.principal_distance_mm", values=(210.0, 300.0))
-    varied = Variations.read(SCENES / "aerial_five.toml").varied(1, sweep, 210.0).setup()
+    varied = Variations.read(SCENES / "aerial_five.toml").with_value(1, sweep, 210.0).setup()
     assert (varied.lens.principal_distance_mm, len(varied.camera.fiducials)) == (210.0, 8)
     camera = SMALL[SMALL.index("[camera]") : SMALL.index("[field]")]
     scene = small(tmp_path, (camera, 'camera = "library:wild-rc8-153"\n'))
-    assert Variations.read(scene).varied(1, sweep, 210.0).setup().lens.principal_distance_mm == 210.0
+    assert Variations.read(scene).with_value(1, sweep, 210.0).setup().lens.principal_distance_mm == 210.0
     with pytest.raises(InputError, match="has no targets"):
         scene_setup(read_scene(SCENES / "juhl_natural.toml"))
 
@@ -221,7 +221,7 @@ def test_fiducials_of_photographs_alone_are_the_mean_of_as_many(tmp_path: Path) 
             ("sigma_height = 0.001", "sigma_height = 0"),
             ('id = "a"\n', f'id = "a"\nsigma_mm = {given}\n'),
         )
-        sigmas = alone(expect(Variations.read(scene).setup()))
+        sigmas = sigmas_of_images_alone(expect(Variations.read(scene).setup()))
         marks = [sigma for parameter, sigma in sigmas.items() if parameter.kind == "fiducial"]
         assert rms(marks) == pytest.approx(0.003 / math.sqrt(2) * math.sqrt(1 - 4 / 8), rel=1e-4)
 

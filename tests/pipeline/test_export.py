@@ -367,7 +367,7 @@ def test_the_nearest_of_several_models_is_named(tmp_path: Path, refusal: Refusal
 def test_a_model_is_chosen_in_pixels_of_the_frames_written(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A lens 3 µm off fits in pixels of 100 µm, and not in those of 20 µm, of --pitch-um or of another picture."""
     block = read_block(read_project(project))
-    frame = next(iter(block.oriented()))
+    frame = next(iter(block.oriented_frames()))
     fits = {1: 0.003, 2: 0.0}
     monkeypatch.setattr(
         "pipeline.exchange.pinhole._fit_opencv", lambda block, frame, names: FittedLens(frame.lens, fits[len(names)])

@@ -29,7 +29,7 @@ from measure import MeasurementError
 from measure.scans.remote import Address
 from pipeline import InputError, read_project
 from pipeline.archive.checked_results import latest, measured_scans
-from pipeline.archive.results_database import Store
+from pipeline.archive.results_database import ResultsDatabase
 from pipeline.archive.status import archive_status
 from pipeline.exchange.exchange_stage import run_export, run_import
 from pipeline.exchange.formats import ExportOptions
@@ -181,9 +181,9 @@ def readings(folder: Path) -> dict[str, Any]:
         return {s.frame.image: [scan_detail(s, Path(s.scan).name), *map(mark_row, s.frame.marks)] for s in kept}
 
     def questions() -> Any:
-        with Store(path) as store:
-            judging = latest(store)
-            queue = build_queue(project, store.connection, judging.row) if judging is not None else ()
+        with ResultsDatabase(path) as database:
+            check_run = latest(database)
+            queue = build_queue(project, database.connection, check_run.row) if check_run is not None else ()
         return [entry for entry in queue if entry.fingerprints != ("",)]
 
     def statuses() -> Any:

@@ -18,13 +18,13 @@ from measure import open_scan
 from measure.flags import Cause, Code, Reason, Status
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
 from pipeline import read_project
-from pipeline.archive.checked_results import read_measurement, stored_judging
-from pipeline.archive.results_database import Store
-from pipeline.archive.thumbnails import Thumbnails, ThumbnailStore
+from pipeline.archive.checked_results import read_measurement, stored_check_run
+from pipeline.archive.results_database import ResultsDatabase
+from pipeline.archive.thumbnails import ThumbnailDatabase, Thumbnails
 from pipeline.errors import InputError
 from pipeline.files.project_file import read_undrawn
 from pipeline.report import ReportData, Thumbnail, judge, render_report
-from pipeline.report.load import MOST_FRAMES, frame_counts, reduced, report_data
+from pipeline.report.load import MOST_FRAMES, frame_counts, reduce_data, report_data
 from pipeline.report.page import MOST_CARDS, render_frame_page
 from pipeline.results.comparator_file import ComparatorPoint, read_measurement_hash, write_comparator
 from pipeline.results.measured_record import Failure, FailureCode, MeasuredScan
@@ -70,7 +70,7 @@ def rows(scans: list[MeasuredScan]) -> Iterator[ComparatorPoint]:
 @pytest.fixture(scope="module")
 def many() -> ReportData:
     scans = [scan(number) for number in range(FRAMES)]
-    return reduced(ReportData("Many", list(rows(scans))), iter(scans), lambda name: f"camera {name[6]}")
+    return reduce_data(ReportData("Many", list(rows(scans))), iter(scans), lambda name: f"camera {name[6]}")
 
 
 def test_a_report_on_thousands_of_frames_is_small_and_escaped(many: ReportData) -> None:
@@ -114,7 +114,7 @@ def test_the_page_of_a_frame_has_all_its_marks() -> None:
     assert 'href="../../report.html"' in html
     assert "<b>0/" not in html
     scans = [scan(number) for number in range(1, 400) if number not in BAD and number not in FAILED]
-    data = reduced(ReportData("Good", list(rows(scans))), iter(scans), lambda _: "k")
+    data = reduce_data(ReportData("Good", list(rows(scans))), iter(scans), lambda _: "k")
     assert judge(data).level == "good"
     assert "No frame needs a look." in render_report(data)
 
@@ -195,8 +195,8 @@ def test_frames_that_need_no_attention_are_counted_as_if_each_were_read(tmp_path
     project = read_project(stored(tmp_path)[0])
     every = report_data(project, lambda path: path)
     comparator = tmp_path / "comparator.csv"
-    with stored_judging(tmp_path / "out" / "measurement.db", read_measurement_hash(comparator)) as judging:
-        present(judging).remember_written(comparator)  # as `reseau measure` says it at its end
+    with stored_check_run(tmp_path / "out" / "measurement.db", read_measurement_hash(comparator)) as check_run:
+        present(check_run).remember_written(comparator)  # as `reseau measure` says it at its end
     monkeypatch.setattr("pipeline.report.load.read_comparator", None)  # nobody reads all of it
     few = report_data(project, lambda path: path)
     of_few, of_every = present(few.totals), present(every.totals)
@@ -224,8 +224,8 @@ def folder(measured_folder: Path, tmp_path: Path) -> Path:
 
 def keys(folder: Path) -> dict[str, str]:
     digest = read_measurement_hash(folder / "comparator.csv")
-    with stored_judging(folder / "out" / "measurement.db", digest) as judging:
-        return present(judging).fingerprints(("a", "b", "c", "none"))
+    with stored_check_run(folder / "out" / "measurement.db", digest) as check_run:
+        return present(check_run).fingerprints(("a", "b", "c", "none"))
 
 
 def grey(pixels: np.ndarray) -> np.ndarray:
@@ -237,11 +237,11 @@ def grey(pixels: np.ndarray) -> np.ndarray:
 def test_every_mark_and_the_whole_scan_have_their_pictures(folder: Path) -> None:
     found = keys(folder)
     assert set(found) == {"a", "b", "c"}
-    with ThumbnailStore(folder / "out" / "measurement.db") as store:
+    with ThumbnailDatabase(folder / "out" / "measurement.db") as database:
         for scan in read_measurement(folder / "out" / "measurement.db"):
             with open_scan(scan.scan) as opened:
                 for mark in scan.frame.marks:
-                    kept = present(store.get(found[scan.frame.image], mark.point, mark.kind))
+                    kept = present(database.get(found[scan.frame.image], mark.point, mark.kind))
                     own = present(cut(opened, mark))
                     assert (kept.origin_px, kept.step_px, kept.pixels.shape) == (
                         own.origin_px,
@@ -249,9 +249,9 @@ def test_every_mark_and_the_whole_scan_have_their_pictures(folder: Path) -> None
                         own.pixels.shape,
                     )
                     assert grey(kept.pixels) @ grey(own.pixels) / own.pixels.size > 0.98
-    with ThumbnailStore(folder / "out" / "measurement.db") as store:
-        stored, key = store.get(keys(folder)["a"]), keys(folder)["a"]
-        jpeg_bytes = store.first("select length(jpeg) from thumbnail where fingerprint = ? and kind = 'frame'", key)
+    with ThumbnailDatabase(folder / "out" / "measurement.db") as database:
+        stored, key = database.get(keys(folder)["a"]), keys(folder)["a"]
+        jpeg_bytes = database.first("select length(jpeg) from thumbnail where fingerprint = ? and kind = 'frame'", key)
     assert stored is not None
     pixels = tifffile.imread(folder / "a.tif").astype(float)
     step = round(stored.step_px)
@@ -295,9 +295,9 @@ def test_pictures_follow_results_that_are_moved_or_merged(folder: Path) -> None:
     before = keys(folder)
     (folder / "a.tif").rename(folder / "aa.tif")
     command("measure", project, "--moved", "--workers", "1")
-    with Store(folder / "out" / "measurement.db") as store:
-        now = set(store.fingerprints()) - set(before.values())
+    with ResultsDatabase(folder / "out" / "measurement.db") as database:
+        now = set(database.fingerprints()) - set(before.values())
     assert len(now) == 1
-    with ThumbnailStore(folder / "out" / "measurement.db") as thumbnails:
+    with ThumbnailDatabase(folder / "out" / "measurement.db") as thumbnails:
         assert thumbnails.get(now.pop(), "1", "fiducial") is not None
         assert thumbnails.get(before["a"], "1", "fiducial") is None

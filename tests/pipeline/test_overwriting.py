@@ -10,7 +10,7 @@ from projects import Refusal, adjusted_project, command, copied, made_record, wr
 
 from pipeline import InputError
 from pipeline.blocks.block_stage import check_folder as check_block
-from pipeline.blocks.block_stage import written_block
+from pipeline.blocks.block_stage import write_block
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures
 from pipeline.calibration.project_files import CalibrationOptions, board_options, write_project
 from pipeline.calibration.project_files import check_folder as check_calibration
@@ -90,7 +90,7 @@ def test_block_writes_over_no_comparator_and_images_but_its_own(
         path.unlink()
     folder = tmp_path / "block"
     folder.mkdir()
-    own = written_block(project, folder, read_comparator(project.comparator), {})
+    own = write_block(project, folder, read_comparator(project.comparator), {})
     (folder / "pictures").mkdir()
     check_block(project, folder)
     with pytest.raises(InputError, match="or is the project's"):

@@ -35,8 +35,8 @@ from pipeline.resampling.resample_stage import (
     _tile_row_height_px,
     open_source,
     resample,
+    resample_frame,
     resample_tasks,
-    resampled,
 )
 from pipeline.workers import WorkerKilled
 
@@ -109,7 +109,7 @@ def test_marks_lie_where_the_transformation_puts_them(turn_deg: float, mirrored:
     middles, picture = marked()
     tifffile.imwrite(tmp_path / "scan.tif", np.rint(picture).astype(np.uint16))
     transformation, matrix, shift = film(turn_deg, mirrored)
-    assert resampled(task(tmp_path / "scan.tif", tmp_path, FrameChain(PITCH_UM, transformation))).problem == ""
+    assert resample_frame(task(tmp_path / "scan.tif", tmp_path, FrameChain(PITCH_UM, transformation))).problem == ""
     with tifffile.TiffFile(tmp_path / "a.tif") as file:
         frame = file.pages[0].asarray().astype(float)
     description = described(tmp_path / "a.tif")
@@ -153,7 +153,7 @@ def test_marks_of_both_scans_of_a_frame_lie_where_their_transformations_put_them
     one, two = (FrameChain(PITCH_UM, way[0]) for way in ways)
     scans = tuple(FrameScan(name, tmp_path / "scan.tif", chain) for name, chain in (("l", one), ("r", two)))
     both = replace(task(tmp_path / "scan.tif", tmp_path, one), scans=scans)
-    assert resampled(both).problem == ""
+    assert resample_frame(both).problem == ""
     with tifffile.TiffFile(tmp_path / "a.tif") as file:
         frame = file.pages[0].asarray().astype(float)
     description = described(tmp_path / "a.tif")
@@ -177,7 +177,7 @@ def test_a_lens_is_taken_out_as_opencv_has_it(scan: Path, tmp_path: Path) -> Non
         np.array([c, x0, y0]),
         np.array([k1 * (name == "k1") for name in parameter_names("opencv")]),
     )
-    done = resampled(task(scan, tmp_path, FrameChain(PITCH_UM, transformation, lens=lens)))
+    done = resample_frame(task(scan, tmp_path, FrameChain(PITCH_UM, transformation, lens=lens)))
     assert done.problem == ""
     pixels = tifffile.imread(tmp_path / "a.tif", key=0)
     description = described(tmp_path / "a.tif")
@@ -236,12 +236,12 @@ def test_a_fisheyes_ideal_picture_ends_where_it_would_be_stretched_without_end()
 
 def test_a_frame_is_kept_until_something_changes_and_is_no_scan(scan: Path, tmp_path: Path) -> None:
     chain = FrameChain(PITCH_UM, film(0.4, False)[0])
-    assert not resampled(task(scan, tmp_path, chain)).kept
-    assert resampled(task(scan, tmp_path, chain)).kept
-    assert not resampled(task(scan, tmp_path, chain, FAST)).kept
+    assert not resample_frame(task(scan, tmp_path, chain)).kept
+    assert resample_frame(task(scan, tmp_path, chain)).kept
+    assert not resample_frame(task(scan, tmp_path, chain, FAST)).kept
     moved = replace(chain, film=replace(chain.film, parameters=1.000000001 * chain.film.parameters))
-    assert not resampled(task(scan, tmp_path, moved, FAST)).kept
-    resampled(task(scan, tmp_path, FrameChain(PITCH_UM, film(0.4, False)[0])))
+    assert not resample_frame(task(scan, tmp_path, moved, FAST)).kept
+    resample_frame(task(scan, tmp_path, FrameChain(PITCH_UM, film(0.4, False)[0])))
     with pytest.raises(MeasurementError, match="has resampled, and no scan"):
         open_scan(tmp_path / "a.tif")
 
@@ -274,7 +274,7 @@ def test_detail_finer_than_a_coarse_pitch_does_not_appear_as_coarse_one(tmp_path
         lines = 30000.0 + 20000.0 * np.sin(2 * np.pi * col / period_px)
         tifffile.imwrite(tmp_path / "s.tif", np.tile(np.rint(lines).astype(np.uint16), (HEIGHT, 1)))
         coarse = replace(task(tmp_path / "s.tif", tmp_path, FrameChain(PITCH_UM, film(0.0, False)[0])), pitch_mm=0.063)
-        resampled(coarse)
+        resample_frame(coarse)
         inner = tifffile.imread(tmp_path / "a.tif", key=0)[20:-20, 20:-20].astype(float)
         assert least < np.ptp(inner) / 40000.0 < most
 
@@ -282,7 +282,7 @@ def test_detail_finer_than_a_coarse_pitch_does_not_appear_as_coarse_one(tmp_path
 def test_a_frame_of_far_more_pixels_than_its_scan_is_refused(scan: Path, tmp_path: Path) -> None:
     """As of a pitch in mm for one in µm, before a disk is full."""
     fine = replace(task(scan, tmp_path, FrameChain(PITCH_UM, film(0.4, False)[0])), pitch_mm=0.0001)
-    done = resampled(fine)
+    done = resample_frame(fine)
     assert done.path is None
     assert "at a pitch of 0.1 µm, more than 100 times its scan's" in done.problem
     assert not list(tmp_path.glob("*.tif"))
@@ -331,7 +331,7 @@ def test_a_killed_process_costs_its_own_frame_alone(tmp_path: Path, monkeypatch:
 
 
 def test_a_scan_that_is_gone_is_a_result(tmp_path: Path) -> None:
-    done = resampled(task(tmp_path / "gone.tif", tmp_path, FrameChain(PITCH_UM, film(0.4, False)[0])))
+    done = resample_frame(task(tmp_path / "gone.tif", tmp_path, FrameChain(PITCH_UM, film(0.4, False)[0])))
     assert done.path is None
     assert "gone.tif" in done.problem
     assert not list(tmp_path.glob("*.tif"))

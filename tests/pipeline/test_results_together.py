@@ -254,12 +254,14 @@ def test_an_ended_second_pass_costs_no_other(project: Path, capsys: Capture, mon
 
     def is_deadly(_: object, args: tuple[Any, ...]) -> bool:
         requests.append(args[0])
-        return isinstance(args[0], second_pass.SearchedAgain) and args[0].image == "frame2"
+        return isinstance(args[0], second_pass.RepeatedSearch) and args[0].image == "frame2"
 
     requests = list[Any]()
     monkeypatch.setattr("pipeline.archive.measure_archive.worker_pool", lambda *_: nullcontext(Loses(is_deadly)))
-    predicted = second_pass._missed  # given no marks, it returns all targets
-    monkeypatch.setattr(second_pass, "_missed", lambda field, scan, *given: predicted(field, scan.changed(()), *given))
+    predicted = second_pass._missed_targets  # given no marks, it returns all targets
+    monkeypatch.setattr(
+        second_pass, "_missed_targets", lambda field, scan, *given: predicted(field, scan.changed(()), *given)
+    )
     (project / "comparator.csv").unlink()  # what is shown is new
     code, own_summary = summary(project, capsys, "run")
     assert code == 1
@@ -267,7 +269,7 @@ def test_an_ended_second_pass_costs_no_other(project: Path, capsys: Capture, mon
     problems = [one for one in own_summary["problems"] if "second pass failed" in one["what"]]
     assert [one["what"].split(":")[0] for one in problems] == ["frame2"]
     assert "its process was ended" in problems[0]["what"]
-    assert {visit.image for visit in requests if isinstance(visit, second_pass.SearchedAgain)} > {"frame1", "frame2"}
+    assert {visit.image for visit in requests if isinstance(visit, second_pass.RepeatedSearch)} > {"frame1", "frame2"}
 
 
 def test_a_place_that_is_held_is_named(project: Path, refusal: Refusal, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,9 +16,17 @@ from projects import FOLDER, changed, comparator_points, content, failed, kept_r
 from measure import Code, Reason, Status
 from measure.results import Kind
 from pipeline import InputError
-from pipeline.archive.checked_results import CheckedResult, Judging, Lot, find_judging, judge, judge_lots, latest
-from pipeline.archive.results_database import Store, check_mergeable
-from pipeline.archive.schema import MEASUREMENTS, opened
+from pipeline.archive.checked_results import (
+    CheckedResult,
+    CheckRun,
+    Lot,
+    find_check_run,
+    latest,
+    store_checks,
+    store_lots,
+)
+from pipeline.archive.results_database import ResultsDatabase, check_mergeable
+from pipeline.archive.schema import MEASUREMENTS, open_database
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_verdict
 from pipeline.provenance import content_hash, file_state, hash_text, parts_hash, result_key, shard_number
 from pipeline.report.data import ReportData, frames
@@ -30,10 +38,10 @@ LOOK = Reason("look", Code.PITCH)
 LOOKED_AT = made_record(problems=(LOOK,))
 
 
-def contents(judging: Judging) -> list[tuple[object, ...]]:
+def contents(check_run: CheckRun) -> list[tuple[object, ...]]:
     """Of every scan after the checks."""
-    judging.store.set_project_folder(FOLDER)
-    return [content(replace(scan, scan=os.path.normpath(scan.scan))) for scan in judging.scans()]
+    check_run.database.set_project_folder(FOLDER)
+    return [content(replace(scan, scan=os.path.normpath(scan.scan))) for scan in check_run.scans()]
 
 
 @pytest.fixture
@@ -42,36 +50,36 @@ def path(tmp_path: Path) -> Path:
 
 
 def test_a_record_comes_back_without_loss_and_once(path: Path) -> None:
-    with Store(path) as store:
-        row = store.keep(kept_result(3), "box/3")
-        other = store.keep(kept_result(4))
-    with Store(path) as store:
-        assert stored(store, row, "3") == content(made_record(3))
-        assert stored(store, other, "4") == content(made_record(4))
-        assert store.fingerprints() == {kept_result(3).fingerprint: row, kept_result(4).fingerprint: other}
-        assert store.identities() == {"scans/3.tif": kept_result(3).identity, "scans/4.tif": kept_result(4).identity}
-        assert store.keep(kept_result(3)) == row != store.keep(kept_result(3, options='{"pose": "90"}'))
-        assert len(store.fingerprints()) == 3
+    with ResultsDatabase(path) as database:
+        row = database.keep(kept_result(3), "box/3")
+        other = database.keep(kept_result(4))
+    with ResultsDatabase(path) as database:
+        assert stored(database, row, "3") == content(made_record(3))
+        assert stored(database, other, "4") == content(made_record(4))
+        assert database.fingerprints() == {kept_result(3).fingerprint: row, kept_result(4).fingerprint: other}
+        assert database.identities() == {"scans/3.tif": kept_result(3).identity, "scans/4.tif": kept_result(4).identity}
+        assert database.keep(kept_result(3)) == row != database.keep(kept_result(3, options='{"pose": "90"}'))
+        assert len(database.fingerprints()) == 3
 
 
 def test_a_judging_changes_what_is_visible_and_not_what_was_measured(path: Path) -> None:
-    with Store(path) as store:
-        rows = [store.keep(kept_result(seed), str(seed)) for seed in (1, 2)]
+    with ResultsDatabase(path) as database:
+        rows = [database.keep(kept_result(seed), str(seed)) for seed in (1, 2)]
         doubted = changed(made_record(1), [2], Status.WEAK, Reason("the others say otherwise", Code.OFF_GIVEN))
         now = [doubted, made_record(2, problems=(Reason("it is the frame of 1.", Code.COPY),))]
         frames = [CheckedResult(row, scan) for row, scan in zip(rows, now, strict=True)]
-        judging = present(find_judging(store, judge(store, {"settings": "a"}, "input", frames).digest))
-        assert judging.made_from == {"settings": "a"}
-        assert contents(judging) == [content(scan) for scan in now]
-        assert [stored(store, row, name) for row, name in zip(rows, "12", strict=True)] == [
+        check_run = present(find_check_run(database, store_checks(database, {"settings": "a"}, "input", frames).digest))
+        assert check_run.made_from == {"settings": "a"}
+        assert contents(check_run) == [content(scan) for scan in now]
+        assert [stored(database, row, name) for row, name in zip(rows, "12", strict=True)] == [
             content(made_record(1)),
             content(made_record(2)),
         ]
-        measured_marks = store.connection.execute(
+        measured_marks = database.connection.execute(
             "select image, status from mark_view where status = 'weak'"
         ).fetchall()
         assert measured_marks == [("1", "weak")]
-        assert store.connection.execute("select count(*) from judged").fetchone() == (8,)  # of the first alone
+        assert database.connection.execute("select count(*) from judged").fetchone() == (8,)  # of the first alone
 
 
 def test_a_lot_whose_input_was_tested_is_not_tested_again(path: Path) -> None:
@@ -82,67 +90,67 @@ def test_a_lot_whose_input_was_tested_is_not_tested_again(path: Path) -> None:
             requests.append(input_hash)
             for seed in seeds:
                 now = changed(made_record(seed), [seed], Status.WEAK, Reason(f"by {input_hash}", Code.OFF_GIVEN))
-                yield CheckedResult(store.keep(kept_result(seed), str(seed)), now)
+                yield CheckedResult(database.keep(kept_result(seed), str(seed)), now)
 
         return Lot(input_hash, frames)
 
-    with Store(path) as store:
-        first = judge_lots(store, {}, "1", [lot("a", 1, 2), lot("b", 3)])
-        second = judge_lots(store, {}, "2", [lot("a", 1, 2), lot("c", 3, 4)])
+    with ResultsDatabase(path) as database:
+        first = store_lots(database, {}, "1", [lot("a", 1, 2), lot("b", 3)])
+        second = store_lots(database, {}, "2", [lot("a", 1, 2), lot("c", 3, 4)])
         assert requests == ["a", "b", "c"]
         assert first.digest != second.digest
         second.drop_others()
-        assert (find_judging(store, first.digest), latest(store)) == (None, second)
+        assert (find_check_run(database, first.digest), latest(database)) == (None, second)
         scans = list(second.scans())
         reasons = {scan.frame.image: [str(mark.reason) for mark in scan.frame.marks if mark.reason] for scan in scans}
         assert reasons == {"1": ["by a"], "2": ["by a"], "3": ["by c"], "4": ["by c"]}
     other = path.parent / "other.db"
-    with Store(other) as store:  # the same, all of it judged anew
-        again = judge_lots(store, {}, "2", [lot("a", 1, 2), lot("c", 3, 4)])
+    with ResultsDatabase(other) as database:  # the same, all of it judged anew
+        again = store_lots(database, {}, "2", [lot("a", 1, 2), lot("c", 3, 4)])
         assert again.digest == second.digest
         anew = contents(again)
         rows = list(comparator_lines(again.points(), {}))
-    with Store(path) as store:
-        judging = present(find_judging(store, second.digest))
-        assert contents(judging) == anew
-        assert list(comparator_lines(judging.points(), {})) == rows
-        points = comparator_points([scan.frame for scan in judging.scans()], judging.pitches_um())
+    with ResultsDatabase(path) as database:
+        check_run = present(find_check_run(database, second.digest))
+        assert contents(check_run) == anew
+        assert list(comparator_lines(check_run.points(), {})) == rows
+        points = comparator_points([scan.frame for scan in check_run.scans()], check_run.pitches_um())
         assert list(comparator_lines(points, {})) == rows
 
 
 def test_a_step_to_a_later_version_is_made_whole_or_not_at_all(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with Store(path) as store:
-        row = store.keep(kept_result(1), "1")
+    with ResultsDatabase(path) as database:
+        row = database.keep(kept_result(1), "1")
     step = "alter table scan add column box text; update scan set box = 'a'"
     broken = f"{step}; insert into nowhere values (1)"
-    monkeypatch.setattr(Store, "schema", replace(MEASUREMENTS, migrations=(*MEASUREMENTS.migrations, broken)))
+    monkeypatch.setattr(ResultsDatabase, "schema", replace(MEASUREMENTS, migrations=(*MEASUREMENTS.migrations, broken)))
     with pytest.raises(InputError, match="nowhere"):
-        Store(path)
-    monkeypatch.setattr(Store, "schema", replace(MEASUREMENTS, migrations=(*MEASUREMENTS.migrations, step)))
-    with Store(path) as store:
-        assert store.connection.execute("select name, box from scan").fetchall() == [("1", "a")]
-        assert store.connection.execute("pragma user_version").fetchone() == (MEASUREMENTS.version + 1,)
-        assert stored(store, row) == content(made_record())
+        ResultsDatabase(path)
+    monkeypatch.setattr(ResultsDatabase, "schema", replace(MEASUREMENTS, migrations=(*MEASUREMENTS.migrations, step)))
+    with ResultsDatabase(path) as database:
+        assert database.connection.execute("select name, box from scan").fetchall() == [("1", "a")]
+        assert database.connection.execute("pragma user_version").fetchone() == (MEASUREMENTS.version + 1,)
+        assert stored(database, row) == content(made_record())
 
 
 def test_what_is_no_store_is_refused(path: Path, tmp_path: Path) -> None:
     path.parent.mkdir()
     path.write_text("measured: nothing")
     with pytest.raises(InputError, match="cannot be used as a database of measurements"):
-        Store(path)
+        ResultsDatabase(path)
     path.unlink()
     with sqlite3.connect(path) as db:
         db.execute("create table a (b)")
     with pytest.raises(InputError, match="not written by reseau"):
-        Store(path)
+        ResultsDatabase(path)
     path.unlink()
-    opened(path).close()
+    open_database(path).close()
     for version, words in ((MEASUREMENTS.version + 1, "a later reseau"), (MEASUREMENTS.first - 1, "before the first")):
         with sqlite3.connect(path) as db:
             db.execute(f"pragma user_version = {version}")
         with pytest.raises(InputError, match=words):
-            Store(path)
-    Store(tmp_path / "a.db").close()
+            ResultsDatabase(path)
+    ResultsDatabase(tmp_path / "a.db").close()
     (tmp_path / "camera.toml").write_text("name = 1")
     others = {"b.db": "there is no such results", "camera.toml": "is no results", "a.db": "joined into"}
     for name, words in others.items():
@@ -154,10 +162,10 @@ WRITER = """
 import sys
 from pathlib import Path
 from projects import kept_result
-from pipeline.archive.results_database import Store
-with Store(Path(sys.argv[1])) as store:
+from pipeline.archive.results_database import ResultsDatabase
+with ResultsDatabase(Path(sys.argv[1])) as database:
     for seed in range(100_000):
-        store.keep(kept_result(seed), str(seed))
+        database.keep(kept_result(seed), str(seed))
         print(seed, flush=True)
 """
 
@@ -174,12 +182,12 @@ def test_what_was_kept_survives_a_kill_and_nothing_is_half(path: Path) -> None:
     output += writer.stdout.readlines()
     writer.wait()
     writer.stdout.close()
-    with Store(path) as store:
-        found = store.fingerprints()
+    with ResultsDatabase(path) as database:
+        found = database.fingerprints()
         complete = sum(line.endswith(b"\n") for line in output)
         assert 40 <= complete <= len(found) <= complete + 1
-        assert all(store.scan(row, "", FOLDER).frame.marks for row in found.values())
-        assert store.connection.execute("pragma integrity_check").fetchone() == ("ok",)
+        assert all(database.scan(row, "", FOLDER).frame.marks for row in found.values())
+        assert database.connection.execute("pragma integrity_check").fetchone() == ("ok",)
 
 
 def test_verdicts_of_scans() -> None:
@@ -240,14 +248,14 @@ def test_the_identity_of_what_is_no_scan(tmp_path: Path) -> None:
 
 
 def test_a_store_in_a_folder_that_cannot_be_written_is_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with Store(path) as store:
-        row = store.keep(kept_result(3), "box/3")
+    with ResultsDatabase(path) as database:
+        row = database.keep(kept_result(3), "box/3")
     monkeypatch.setattr("pipeline.archive.schema.os.access", lambda *_: False)
-    with Store(path) as store:
-        assert store.scan(row, "box/3", FOLDER).frame.marks
+    with ResultsDatabase(path) as database:
+        assert database.scan(row, "box/3", FOLDER).frame.marks
         assert [file.name for file in path.parent.iterdir()] == [path.name]  # SQLite would put two files beside it
         with pytest.raises(sqlite3.OperationalError, match="readonly"):
-            store.keep(kept_result(4), "box/4")
+            database.keep(kept_result(4), "box/4")
 
 
 @pytest.mark.parametrize(
@@ -255,14 +263,14 @@ def test_a_store_in_a_folder_that_cannot_be_written_is_read(path: Path, monkeypa
 )
 def test_a_judging_that_is_lost_is_not_taken_for_none(change: str, path: Path) -> None:
     """Else what each scan gave would stand for what all together say of it."""
-    with Store(path) as store:
-        row = store.keep(kept_result(1), "1")
-        judge(store, {}, "a", [CheckedResult(row, LOOKED_AT)])
+    with ResultsDatabase(path) as database:
+        row = database.keep(kept_result(1), "1")
+        store_checks(database, {}, "a", [CheckedResult(row, LOOKED_AT)])
     with sqlite3.connect(path) as db:
         db.execute(change)
-    with Store(path) as store:
+    with ResultsDatabase(path) as database:
         with pytest.raises(InputError, match=r"list of checked images is damaged.*measure --retry"):
-            latest(store)
-        store.forget_damaged()
-        assert latest(store) is None
-        assert stored(store, row) == content(made_record())
+            latest(database)
+        database.forget_damaged()
+        assert latest(database) is None
+        assert stored(database, row) == content(made_record())

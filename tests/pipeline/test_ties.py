@@ -28,7 +28,7 @@ from pipeline.exchange.incoming import fiducial_camera
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.tie_stage import add_joins, check_tie_names
 from pipeline.resampling.canvas import FrameChain
-from pipeline.resampling.resample_stage import FAST, FrameScan, ResampleTask, resampled
+from pipeline.resampling.resample_stage import FAST, FrameScan, ResampleTask, resample_frame
 from pipeline.results.comparator_file import ComparatorPoint, read_comparator, write_comparator
 from synthetic_images.render import render_scene
 from synthetic_images.scene import DiskField, Scene, SceneCamera, SceneDistortion, SceneFilm, SceneImage, SceneScanner
@@ -143,7 +143,7 @@ def lattice_px(places_mm: Array) -> Array:
     return (places_mm - (-114.0, 114.0)) * (1.0, -1.0) / projects.PITCH_MM
 
 
-def mapped(noise_px: float = 0.0) -> block_stage.Mapped:
+def mapped(noise_px: float = 0.0) -> block_stage.Reconstruction:
     """What COLMAP would say of a perfect block, in a frame that is turned, shifted and of another scale."""
     rng = np.random.default_rng(5)
     poses = {}
@@ -160,10 +160,10 @@ def mapped(noise_px: float = 0.0) -> block_stage.Mapped:
         ]
         for j in range(100)
     }
-    return block_stage.Mapped(poses, tracks)
+    return block_stage.Reconstruction(poses, tracks)
 
 
-def disagree(block: block_stage.Mapped, off_px: float) -> block_stage.Mapped:
+def disagree(block: block_stage.Reconstruction, off_px: float) -> block_stage.Reconstruction:
     """The same places, but points that do not quite agree with them."""
     tracks = {j: [replace(sight, off_px=off_px) for sight in track] for j, track in block.tracks.items()}
     return replace(block, tracks=tracks)
@@ -257,13 +257,13 @@ def control(count: int) -> tuple[list[ComparatorPoint], dict[str, ObjectPoint]]:
 
 def test_poses_come_into_the_frame_of_the_control() -> None:
     rays = {f"f{i}": np.array([projects.TRUTH.c, projects.TRUTH.x0, projects.TRUTH.y0]) for i in projects.IMAGES}
-    placed = block_stage.oriented_by_control(mapped(), PICTURES, *control(4), rays)
+    placed = block_stage.orient_by_control(mapped(), PICTURES, *control(4), rays)
     for i in projects.IMAGES:
         turn, station = placed[f"f{i}"]
         np.testing.assert_allclose(turn, rotation(*projects.TRUTH.attitudes[i]), atol=1e-9)
         np.testing.assert_allclose(station, projects.TRUTH.stations[i], atol=1e-6)
     with pytest.raises(InputError, match="2 points with coordinates"):
-        block_stage.oriented_by_control(mapped(), PICTURES, *control(2), rays)
+        block_stage.orient_by_control(mapped(), PICTURES, *control(2), rays)
 
 
 def test_control_in_either_scan_of_a_frame_places_the_block(tmp_path: Path) -> None:
@@ -277,7 +277,7 @@ def test_control_in_either_scan_of_a_frame_places_the_block(tmp_path: Path) -> N
         cut.append(
             replace(mark, image=f"{mark.image}{'r' if is_right else 'l'}", xy_mm=projects.present(mark.xy_mm) - shift)
         )
-    placed = block_stage.oriented_by_control(mapped(), [half_picture(i) for i in projects.IMAGES], cut, points, rays)
+    placed = block_stage.orient_by_control(mapped(), [half_picture(i) for i in projects.IMAGES], cut, points, rays)
     for i in projects.IMAGES:
         np.testing.assert_allclose(placed[f"f{i}"][1], projects.TRUTH.stations[i], atol=1e-6)
     images = ["image,part_of", *(f"f{i}{half},f{i}" for i in projects.IMAGES for half in "lr")]
@@ -285,7 +285,7 @@ def test_control_in_either_scan_of_a_frame_places_the_block(tmp_path: Path) -> N
     text = 'camera = "camera.toml"\n[object]\nimages = "images.csv"'
     path = projects.write_tables(tmp_path, text, camera='name = "K"', images=images)
     write_comparator(path.with_name("comparator.csv"), cut, {})
-    own = block_stage.written_block(read_project(path), tmp_path / "block", cut, {"f1": placed["f1"]})
+    own = block_stage.write_block(read_project(path), tmp_path / "block", cut, {"f1": placed["f1"]})
     again = read_images(tmp_path / "block" / "images.csv")
     assert again.part_of == {f"f{i}{half}": f"f{i}" for i in projects.IMAGES for half in "lr"}
     assert own.scanned_frame("f2l") == "f2"
@@ -311,7 +311,7 @@ def test_observed_orientations_of_a_block_stay_observations(tmp_path: Path) -> N
     marks = [replace(mark, image=f"f{i}") for mark in control(1)[0][:1] for i in range(3)]
     write_comparator(path.with_name("comparator.csv"), marks, {})
     pose = rotation(0.1, -0.2, 0.3), np.array([100.0, 200.0, 300.0])
-    own = block_stage.written_block(read_project(path), tmp_path / "block", marks, {"f0": pose, "f2": pose})
+    own = block_stage.write_block(read_project(path), tmp_path / "block", marks, {"f0": pose, "f2": pose})
     again = read_images(tmp_path / "block" / "images.csv")
     for exteriors in (again.exterior, projects.present(own.given_images).exterior):
         first, second, third = (projects.present(exteriors[f"f{i}"]) for i in range(3))
@@ -334,7 +334,7 @@ def test_pictures_lie_where_the_lattice_says(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "f2.tif", np.rint(4000.0 + 14.0 * cols + spot).astype(np.uint16), compression="deflate")
     scans = (FrameScan("f2", tmp_path / "f2.tif", chain(2)),)
     task = ResampleTask("f2", "K", "0m", projects.PITCH_MM, FAST, None, tmp_path / "frame.tif", scans)
-    assert resampled(task).problem == ""
+    assert resample_frame(task).problem == ""
     with pytest.raises(InputError, match="'a/b' and 'a_b' would share"):
         block_stage.write_pictures(
             [replace(task, image=name) for name in ("a/b", "a_b")], {"K": BLOCK_CAMERA}, tmp_path
