@@ -13,7 +13,10 @@ from adjust.problem.network import Image, Network
 from adjust.problem.parameter import Parameter, description
 
 TARGETS_NEEDED = 3
-LARGEST_SIGMA = 0.02  # standard deviation of most marks, relative to half the extent of an image's marks
+LEAST_SIGMA, LARGEST_SIGMA = (
+    1e-7,
+    0.02,
+)  # standard deviation of most marks, relative to half the extent of an image's marks
 DEFINITE = 1e-13  # smallest eigenvalue of an earlier calibration's correlation matrix
 
 Faults = Iterator[str]  # sentences; the first one is raised
@@ -258,11 +261,11 @@ def _place_faults(network: Network) -> Faults:
 
 
 def _sigma_faults(network: Network) -> Faults:
-    """Standard deviations of most marks that are a large part of the images: another unit."""
+    """Standard deviations of most marks that are a large part of the images, or none: another unit."""
     sigma_mm = np.sqrt(np.trace(network.observations.covariance_mm2, axis1=1, axis2=2) / 2.0)
     by_image = np.array([network.extent_by_image[image.name].half_mm for image in network.images])
     half_mm = by_image[network.image_numbers]
-    if np.median(sigma_mm / half_mm) > LARGEST_SIGMA:
+    if not LEAST_SIGMA <= np.median(sigma_mm / half_mm) <= LARGEST_SIGMA:
         yield (
             f"The standard deviations of the marks, {np.median(sigma_mm):.3g} mm in the middle, are "
             f"{100.0 * np.median(sigma_mm / half_mm):.2g} % of half the extent of the marks in an image: they are in "

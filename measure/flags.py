@@ -75,6 +75,7 @@ class Code(MeaningfulWord):
     PITCH = "pitch", "The marks fit another pixel pitch."
     NO_CHECK = "no-check", "There are only as many marks as the transformation needs: no redundancy."
     NO_BOARD = "no-board", "The board, or a part of its markers, was not found."
+    OTHER_CAMERA = "other-camera", "The fiducials fit another camera of the project."
     PLATE = "plate", "The plate in the image contradicts the camera."
     FEW_TIES = "few-ties", "Fewer natural points were found than wanted."
     OTHER_PART = "other-part", "Another part of the same frame shows it."

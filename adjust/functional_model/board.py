@@ -63,6 +63,13 @@ def strain_directions(xyz: Array, axes: Array) -> Array:
     return np.stack([*stretches, *shears], axis=1)
 
 
+def datum_directions(xyz: Array) -> Array:
+    """(n, 7, 3) displacements of points (n, 3) by shifts, turns about X, Y and Z and a scale of 1, about the centre."""
+    places = xyz - xyz.mean(axis=0)
+    turns = np.cross(np.eye(3), places[:, None])
+    return np.concatenate([np.broadcast_to(np.eye(3), (len(xyz), 3, 3)), turns, places[:, None]], axis=1)
+
+
 def disk_directions(at: Mapping[tuple[int, int], Array], axes: Array, radius: float) -> Array:
     """(n, 1, 3) displacements of disks' centres by a squared radius of 1.
 

@@ -25,8 +25,9 @@ from adjust.problem.problem import Problem, number_reduced
 from adjust.problem.unknowns import Reduction
 from adjust.quality.variance_components import added_variance
 from adjust.rank_defect.datum import held_as_known
-from adjust.solution.blunder_hypotheses import Trials, blunder_sentence, orientations_elsewhere
+from adjust.solution.blunder_hypotheses import Trials, blunder_sentence
 from adjust.solution.coordinate_blunders import CoordinateBlunder, find_coordinate_blunders
+from adjust.solution.given_orientations import orientations_elsewhere, unlike_approximations
 from adjust.solution.options import Datum, Method, Options
 from adjust.solution.plausibility import check_plausibility
 from adjust.solution.result import Adjustment, adjust_problem
@@ -318,8 +319,10 @@ class _Solver:
             return result
         if not weighs_anew:
             self._refuse_blunder(network, result)
-        elsewhere = orientations_elsewhere(network, result)
-        return replace(result, remarks=(*result.remarks, elsewhere)) if elsewhere else result
+        if elsewhere := orientations_elsewhere(network, result):
+            return replace(result, remarks=(*result.remarks, elsewhere))
+        unlike = unlike_approximations(network, result)
+        return replace(result, unused=(*result.unused, unlike)) if unlike else result
 
     def _refuse_blunder(self, network: Network, given: Adjustment | None) -> None:
         if sentence := blunder_sentence(network, given, self.trials):

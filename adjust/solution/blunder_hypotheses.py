@@ -4,7 +4,7 @@ Mirrored points or exchanged axes, another unit, y pointing down, exchanged fram
 distance. Such a blunder leaves residuals everywhere, and tests of single observations would reject good ones.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, combinations, product
@@ -12,79 +12,33 @@ from itertools import chain, combinations, product
 import numpy as np
 from scipy.special import chdtrc
 
-from adjust.array_types import Array, Mask
+from adjust.array_types import Array
 from adjust.functional_model.lens import Prior
-from adjust.functional_model.rotation import angles_from_rotation, rotation_from_angles
-from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.problem.network import Network, ObjectPoint
 from adjust.problem.parameter import shortened
+from adjust.solution.given_orientations import (
+    AXES,
+    CLEARLY,
+    FACTORS,
+    TOLERATED,
+    UNIT,
+    adjusted_stations,
+    given_stations,
+    is_near,
+    orientations_elsewhere,
+    times_too,
+    wrong_orientations,
+)
 from adjust.solution.result import Adjustment
 from adjust.solution.wrong_names import LARGE, NAMED, transformed_fields
 
-TOLERATED = 2.0  # factor on the given standard deviations up to which residuals need no explanation
 CHECKED = 10  # smallest redundancy for an explanation
 WORST, RARE = 3, 1e-3  # frames of a camera tried with another one; ratio of likelihoods to be exceeded by one trial
 MOST_PAIRS = 15  # pairs of frames tried as exchanged, largest residuals first
 ONE_AXIS = 10.0  # sigma0 that one axis in another unit leaves at least
-CLEARLY = 3.0  # factor by which an explanation must reduce sigma0
-NEAR = 0.3  # fraction of its distance from the field's centre that a station may lie off its given place
 PITCHES = (10.0, 25.4, 100.0, 1000.0, 2.0)  # ratios of principal distances by another unit or pixel pitch
 ROUND = 0.05  # relative tolerance of these ratios
-FLAT = 1e-3  # relative thickness of a flat field, which is mirrored by mirroring the stations
-UNITS = (1000.0, 100.0, 10.0, 0.3048, 25.4)  # ratios of length units: m, dm, cm, mm, feet, inches
-FACTORS = (*UNITS, *(1.0 / each for each in UNITS))
 MIRRORED = "the points are mirrored: the sign of X, Y or Z of all of them is wrong, or two axes are exchanged"
-AXES = {  # blunders that mirror the points, and the matrices that correct them
-    **{f"the sign of {'XYZ'[i]} of all points is wrong": np.diag(1.0 - 2.0 * np.eye(3)[i]) for i in range(3)},
-    **{
-        f"{axes} of all points are exchanged": np.eye(3)[order]
-        for axes, order in (("X and Y", [1, 0, 2]), ("X and Z", [2, 1, 0]), ("Y and Z", [0, 2, 1]))
-    },
-}
-
-UNIT = "the coordinates of the points are {} for the stations or distances: another unit"
-
-
-def _times_too(factor: float) -> str:
-    """Words on values that a factor corrects."""
-    return f"{max(factor, 1.0 / factor):.4g} times too {'large' if factor < 1.0 else 'small'}"
-
-
-Reading = Callable[[Array], Array]
-ANGLES: dict[str, Reading] = {  # mistakes of the angles of images.csv, and how to read these then
-    **{
-        f"{what} with the other sign": partial(np.multiply, signs)
-        for what, signs in (
-            ("omega", (-1.0, 1.0, 1.0)),
-            ("phi", (1.0, -1.0, 1.0)),
-            ("kappa", (1.0, 1.0, -1.0)),
-            ("all angles", (-1.0, -1.0, -1.0)),
-        )
-    },
-    "omega and phi exchanged": lambda angles: angles[:, [1, 0, 2]],
-    "omega and kappa exchanged": lambda angles: angles[:, [2, 1, 0]],
-    "phi and kappa exchanged": lambda angles: angles[:, [0, 2, 1]],
-    "angles in gon, not degrees": partial(np.multiply, 0.9),
-    "angles in radians, not degrees": partial(np.multiply, 180.0 / np.pi),
-    "angles of the rotation from camera to object": lambda angles: angles_from_rotation(
-        rotation_from_angles(angles).swapaxes(1, 2)
-    ),
-    "angles of a camera with y down and z forward": lambda angles: angles_from_rotation(
-        np.diag([1.0, -1.0, -1.0]) @ rotation_from_angles(angles)
-    ),
-    **{
-        f"kappa {degrees} degrees larger": partial(np.add, (0.0, 0.0, np.radians(degrees)))
-        for degrees in (90, 180, 270)
-    },
-}
-STATIONS: dict[str, Reading] = {  # the same of the stations
-    **{f"{'XYZ'[i]}0 with the other sign": partial(np.multiply, 1.0 - 2.0 * np.eye(3)[i]) for i in range(3)},
-    "X0 and Y0 exchanged": lambda stations: stations[:, [1, 0, 2]],
-    "X0 and Z0 exchanged": lambda stations: stations[:, [2, 1, 0]],
-    "Y0 and Z0 exchanged": lambda stations: stations[:, [0, 2, 1]],
-    **{f"Z0 {factor:.4g} times as large: another unit": partial(np.multiply, (1.0, 1.0, factor)) for factor in FACTORS},
-    **{UNIT.format(_times_too(1.0 / factor)): partial(np.multiply, factor) for factor in FACTORS},
-}
 
 
 @dataclass(frozen=True)
@@ -136,7 +90,7 @@ def network_hypotheses(network: Network, bare: Network, given: Adjustment | None
     for factor in FACTORS if network.distances else ():
         by = factor * np.eye(3)
         remedy = "Give both in the unit that [object] unit names."
-        yield [NetworkHypothesis(UNIT.format(_times_too(factor)), _move_points(network, by), remedy, by)]
+        yield [NetworkHypothesis(UNIT.format(times_too(factor)), _move_points(network, by), remedy, by)]
     is_far = given is None or not given.converged or given.sigma0 > ONE_AXIS
     exchanged, mirrored_images = _exchanged_frames(network, given), _mirrored_images(network)
     heights = _one_axis(network, (2,)) if is_far else ()  # before distances, of which one may do the same
@@ -154,7 +108,7 @@ def _one_axis(network: Network, axes: Sequence[int]) -> Iterator[NetworkHypothes
     for axis, factor in product((axis for axis in axes if extents[axis]), FACTORS):
         name, others = "XYZ"[axis], " and ".join("XYZ".replace("XYZ"[axis], ""))
         by = np.diag(np.where(np.arange(3) == axis, factor, 1.0))
-        words = f"{name} of all points is {_times_too(factor)} for {others}: another unit"
+        words = f"{name} of all points is {times_too(factor)} for {others}: another unit"
         yield NetworkHypothesis(words, _move_points(network, by), moved=by)
 
 
@@ -336,19 +290,26 @@ def blunder_sentence(network: Network, given: Adjustment | None, trials: Trials)
     if trials.explains(given):
         return ""
     bare = replace(network, images=tuple(replace(image, exterior=None) for image in network.images))
-    stations = _given_stations(network)
+    stations = given_stations(network)
     if stations:
         alone = trials.adjust(bare)
         if alone is not None and trials.explains(alone):
-            return orientations_elsewhere(network, alone, is_observed=True)
+            if elsewhere := orientations_elsewhere(network, alone, is_observed=True):
+                return elsewhere
+            what, without = wrong_orientations(network, alone, trials.family) or ("", bare)
+            found = trials.adjust(without) if what else None
+            if found is None or not trials.explains(found):
+                return ""
+            rows = NetworkHypothesis(what, without, "Correct these rows of images.csv, or leave them out.")
+            return _sentence([rows], found, given, trials.family)
     for alike in network_hypotheses(network, bare, given):
         found = trials.adjust(alike[0].network)
         better = found is not None and (given is None or CLEARLY * found.sigma0 < given.sigma0 or not given.converged)
         if found is not None and better and trials.explains(found):
             if len(alike) > 1 and stations:  # those whose stations lie near the given ones; all if none does
-                adjusted, depths, places = _stations(found, stations)
+                adjusted, depths, places = adjusted_stations(found, stations)
                 unmoved = adjusted @ np.linalg.inv(alike[0].moved).T
-                alike = [each for each in alike if _near(unmoved @ each.moved.T, places, depths).all()] or alike
+                alike = [each for each in alike if is_near(unmoved @ each.moved.T, places, depths).all()] or alike
             return _sentence(alike, found, given, trials.family)
     return ""
 
@@ -380,104 +341,3 @@ def _found_distance(camera: str, given_mm: float, found: Adjustment) -> str:
     is_unit = any(abs(times / each - 1.0) < ROUND for each in PITCHES)
     why = f", so that it is given {times:.3g} times too {how}: another unit, or a wrong pitch_um" if is_unit else ""
     return f": it is found as {c:.6g} mm{why}"
-
-
-def _given_stations(network: Network) -> dict[str, Array]:
-    images = (image for image in network.images if image.name not in network.unoriented)
-    return {image.name: image.exterior.center for image in images if image.exterior is not None}
-
-
-def _stations(result: Adjustment, given: Mapping[str, Array]) -> tuple[Array, Array, Array]:
-    """Adjusted stations (n, 3), their distances (n,) from the centre of the points, and the given stations (n, 3)."""
-    stations = np.array([adjusted_image(result, name).station for name in given])
-    depths = np.linalg.norm(stations - _points(result).mean(axis=0), axis=1)
-    return stations, depths, np.array([*given.values()])
-
-
-def _points(result: Adjustment) -> Array:
-    shown = result.network.observed_points
-    return adjusted_places(result, [each.id for each in result.network.points if each.id in shown])
-
-
-def _near(stations: Array, given: Array, depths: Array) -> Mask:
-    return np.asarray(np.linalg.norm(stations - given, axis=1) < NEAR * depths)
-
-
-def orientations_elsewhere(network: Network, result: Adjustment, is_observed: bool = False) -> str:
-    """Explain orientations that are not as they are given by mistakes of their table; empty where none does.
-
-    Possible causes: exchanged names, wrong signs, units or columns of stations or angles, or mirrored points of a flat
-    field. is_observed: whether standard deviations tell that the orientations contradict the images.
-    """
-    given = {image.name: image.exterior for image in network.images if image.exterior is not None}
-    stations_given = _given_stations(network)
-    if result.termination == "singular" or len(stations_given) < 2 or not network.observed_points:
-        return ""
-    names, (stations, depths, places) = list(stations_given), _stations(result, stations_given)
-    rotations = np.array([adjusted_image(result, name).rotation for name in names])
-    angles = np.array([given[name].values[3:] for name in names])
-    off = np.flatnonzero(~_near(stations, places, depths))
-    found = list[str]()
-    turned, is_turned = _best_reading(ANGLES, angles, lambda values: _rotation_errors(values, rotations), is_observed)
-    moved, is_moved = _best_reading(
-        STATIONS, places, lambda values: np.linalg.norm(values - stations, axis=1) / depths, is_observed
-    )
-    nearest = np.linalg.norm(stations[off, None] - places[off], axis=2).argmin(axis=1) if len(off) else off
-    if len(off) > 1 and len(set(nearest)) == len(off) and _near(stations[off], places[off[nearest]], depths[off]).all():
-        # Exchanged names exchange attitudes too.
-        exchanged = _rotation_errors(angles[off[nearest]], rotations[off])
-        is_kept = CLEARLY * np.linalg.norm(_rotation_errors(angles[off], rotations[off])) < np.linalg.norm(exchanged)
-        if not (moved and is_kept):
-            found.append(
-                f"The frames {shortened([names[i] for i in off], NAMED)} each lie where another's orientation is given:"
-                " their names are exchanged, in the scans or in images.csv."
-            )
-            is_own = CLEARLY * np.linalg.norm(exchanged) < np.linalg.norm(_rotation_errors(angles[off], rotations[off]))
-            if is_own or not moved:
-                return found[0]
-            found[0] = f"{found[0][:-1]}; or:"
-    if (is_turned and turned) or (is_moved and moved):
-        words = "; ".join(each for each in (moved, turned) if each)
-        return " ".join(
-            [
-                *found,
-                f"The orientations of all {len(names)} images are not those that the points give, but would be with "
-                f"another reading: {words}. Correct images.csv, or the points.",
-            ]
-        )
-    if 2 * len(off) <= len(names):
-        return ""
-    points = _points(result)
-    middle = points.mean(axis=0)
-    _, extents, axes = np.linalg.svd(points - middle, full_matrices=False)
-    if extents[-1] > FLAT * extents[0]:
-        return ""
-    reflected = stations - 2.0 * np.outer((stations - middle) @ axes[-1], axes[-1])
-    for words, by in AXES.items():
-        if _near(reflected @ by.T, places, depths).all():
-            return (
-                f"By the points the stations lie nowhere near where they are given, but all {len(names)} would with "
-                f"another reading of the points: {words}. Correct the points, or the stations."
-            )
-    return ""
-
-
-def _rotation_errors(angles: Array, rotations: Array) -> Array:
-    """(n,) rad, angles between given attitudes (n, 3) and rotations (n, 3, 3)."""
-    cosine = (np.einsum("nij,nij->n", rotation_from_angles(angles), rotations) - 1.0) / 2.0
-    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)))
-
-
-def _best_reading(
-    readings: Mapping[str, Callable[[Array], Array]], given: Array, errors: Callable[[Array], Array], is_observed: bool
-) -> tuple[str, bool]:
-    """The reading of given values (n, 3) that makes the errors of all images CLEARLY smaller; empty where none does.
-
-    Also returns whether the values as given contradict the images.
-    """
-    as_given, trials = np.linalg.norm(errors(given)), {words: errors(read(given)) for words, read in readings.items()}
-    best = min(trials, key=lambda words: float(np.linalg.norm(trials[words])))
-    error = np.linalg.norm(trials[best])
-    alike = [words for words, each in trials.items() if np.linalg.norm(each) < CLEARLY / 2.0 * error]
-    fits = CLEARLY * error < as_given and trials[best].max() < NEAR
-    return " or ".join(alike) if fits else "", bool(is_observed or errors(given).max() > NEAR)

@@ -55,6 +55,7 @@ LEFT = 0.5  # fraction of the excess of v'Pv over its redundancy, or of what is 
 WORTH = 0.3  # fraction of the largest first-order decrease above which a hypothesis is adjusted
 STEPS = 40  # images of another pitch need about 20
 LEAST_SHARE = 0.05  # of v'Pv; further lens terms remove up to 0.02 on real boards
+FREED = 1e6  # factor on variances at first that leave the given points no redundancy
 TURNS = 8  # adjustments, each with the variance of the one before
 ENDING = ("groups", "distances", "affinities")  # after which nothing else is sought
 OF_IMAGES = ("radial", "decentering", "bow", "pixels", "shear", "drift", "jump", "interior", "groups", "distances")
@@ -372,24 +373,29 @@ def _added_noise(run: Run, redundancy: int) -> Noise | None:
 
 def _wide_control(run: Run) -> Noise | None:
     """Adjust with larger standard deviations of the given points that explain all residuals; None where none do."""
-    vpv, freedom = run.group_sums((run.units.groups == "control") & run.weighting.used)
-    if run.weighting.factors or freedom < CHECKED or chdtrc(freedom, vpv) > NOISE_LEVEL:
+    control = (run.units.groups == "control") & run.weighting.used
+    vpv, freedom = run.group_sums(control)
+    is_held = freedom < CHECKED <= control.sum()  # by standard deviations that leave them no redundancy
+    if run.weighting.factors or not (is_held or (freedom >= CHECKED and chdtrc(freedom, vpv) <= NOISE_LEVEL)):
         return None
-    wide = replace(run, weighting=replace(run.weighting, factors={"control": 1.0}))
+    wide = replace(run, weighting=replace(run.weighting, factors={"control": FREED if is_held else 1.0}))
     for _ in range(TURNS):
         wide = again(wide, refined_factors(wide), STEPS)
         if not wide.converged:
             return None
     if not (_is_noise(wide) and _groups_agree(wide)):
         return None
-    factor = wide.weighting.factors["control"]
+    factor, (_, freedom) = wide.weighting.factors["control"], wide.group_sums(control)
     words = (
         "The standard deviations given to the object points are too small everywhere, by a factor of "
         f"{np.sqrt(factor):.2g}: the marks agree with each other, and the points' "
         "differences from them are plain noise",
         "Give sX, sY and sZ as the points have them, or variance_components = true under [adjust].",
     )
-    return words, wide, freedom * float(np.log(factor))
+    # The logarithm of the likelihood changes by the group's redundancy, f / (f + q) of each coordinate, times d ln f.
+    count = int(run.units.sizes[control].sum())
+    q = factor * (count / freedom - 1.0)
+    return words, wide, count * float(np.log((factor + q) / (1.0 + q)))
 
 
 def _is_noise(run: Run) -> bool:

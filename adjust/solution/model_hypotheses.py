@@ -32,7 +32,6 @@ NONE = partitions.Selection()
 REFOCUSED = "Fix focus and zoom, switch autofocus and stabilisation off, and take the pictures again."
 RADIAL_DEGREES = (3, 5, 7, 9, 11, 13)  # powers of the radius, as of k1 to k6
 TERMS_TOGETHER = 2  # radial terms tested jointly
-MOST_MOVED = 60  # images that may have affinities of their own: cost grows with the square of their number
 FEWEST_DRIFTING = 4  # images that tell a drift from their scatter
 LEAST_CHANGE = 0.05  # of the distance
 NAMED = 5  # images named in a message, and points with their errors
@@ -231,22 +230,15 @@ def _pixel_words(camera: str, per_mm: float) -> Words:
 
 def _own_affinities(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     """An affinity of each digital image's own, as a camera or object that moves while rows are read gives it."""
-    problem, network = run.problem, run.problem.network
-    rows = problem.targets_by_camera[camera.name]
-    numbers, of_row = np.unique(problem.image_numbers[rows], return_inverse=True)
-    images = [network.images[number] for number in numbers]
-    if not FEWEST_IMAGES <= len(images) <= MOST_MOVED or any(image.transformation != "none" for image in images):
+    network, rows = run.problem.network, run.problem.targets_by_camera[camera.name]
+    names = [network.images[number].name for number in np.unique(run.problem.image_numbers[rows])]
+    films = {image.transformation for image in network.images if image.camera == camera.name}
+    if len(names) < FEWEST_IMAGES or films != {"none"}:
         return
-    half_mm = max(network.extent_by_image[image.name].half_mm for image in images)
-    both = PolynomialTerms.from_terms(AFFINITY_TERMS).correction(
-        _from_principal_point(run, camera), np.zeros(2), np.zeros(2), half_mm
-    )
-    fields_mm = np.zeros((len(run.end.v_mm), len(images), 2, 2))
-    fields_mm[rows, of_row] = both.parameter_jacobian.swapaxes(1, 2)[rows]
 
     def words(found: Estimate) -> tuple[str, str]:
-        sizes = np.hypot(*found.value.reshape(-1, 2).T) / half_mm
-        worst = shortened([images[k].name for k in np.argsort(-sizes, kind="stable")], NAMED)
+        sizes = np.hypot(*(found.value.reshape(-1, 2) - (1.0, 0.0)).T)
+        worst = shortened([names[k] for k in np.argsort(-sizes, kind="stable")], NAMED)
         return (
             f"The images of camera {camera.name} are distorted each in its own way, stretched or sheared by up to "
             f"{100.0 * sizes.max():.2g} % (largest first: {worst}), or each has a principal point of its own",
@@ -254,15 +246,20 @@ def _own_affinities(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
             "stabilisation: fix both, give more light, and take the pictures again.",
         )
 
+    # As of a film, whose unknowns are eliminated with the exterior orientation: the cost is linear in the images.
+    images = tuple(replace(each, transformation="affine") if each.name in names else each for each in network.images)
+    problem = continue_problem(run, replace(network, images=images))
+    lens_family = family(camera.distortion.family)
+    unknowns, sigma = problem.unknowns, problem.unknowns.sigma.copy()
+    affine = np.array([unknowns.transformation[name] for name in names])
+    added = affine[:, 1:3].ravel()
     # Affinities of all images of a flat object leave the interior orientation open, and contain the camera's own: these
     # are held where they are.
-    unknowns, lens_family = problem.unknowns, family(camera.distortion.family)
     known = {*INTERIOR_NAMES, *dict(lens_family.groups).get("affinity", ())}
-    sigma = unknowns.sigma.copy()
     sigma[unknowns.camera[camera.name][[name in known for name in (*INTERIOR_NAMES, *lens_family.parameters)]]] = 0.0
-    held = replace(run, problem=replace(problem, unknowns=replace(unknowns, sigma=sigma)))
-    by_affinity_mm = fields_mm.reshape(len(fields_mm), -1, 2)
-    yield _displaced_images(held, "affinities", "affinities", camera, words, by_affinity_mm)
+    sigma[np.setdiff1d(affine, added)] = 0.0
+    held = replace(problem, unknowns=replace(unknowns, sigma=sigma))
+    yield ModelHypothesis("affinities", words, held, added)
 
 
 def _drift(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:

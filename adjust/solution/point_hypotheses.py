@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from scipy.special import chdtrc
 
 from adjust.array_types import Array, Indices, Mask
-from adjust.functional_model.board import BoardForm, board_form, disk_directions, strain_directions
+from adjust.functional_model.board import BoardForm, board_form, datum_directions, disk_directions, strain_directions
 from adjust.problem.condition_equations import computed_observations
 from adjust.problem.network import Network
 from adjust.problem.parameter import shortened
@@ -46,7 +46,8 @@ def point_hypotheses(run: Run, is_suspicious: bool, is_fitted: bool) -> Iterator
 
 
 def _deformations(run: Run) -> Iterator[ModelHypothesis]:
-    """A strain of the object of all given points; a bend or a twist of a flat one, or another diameter of its disks."""
+    """A strain of the object of all given points, another datum than that of observed orientations, and a bend or a
+    twist of a flat one."""
     network = run.problem.network
     if not _is_given(network):
         return
@@ -59,9 +60,27 @@ def _deformations(run: Run) -> Iterator[ModelHypothesis]:
         is_bent = any(board.by_observation is None for board in network.boards)
         bends = [form.twist_directions] if is_bent else [form.bend_directions, form.twist_directions]
         rows += [("bend", _bend_words, np.concatenate(bends, axis=1))]
+    if any(image.is_observed for image in network.images):
+        rows.append(("datum", _datum_words, datum_directions(np.array(list(network.known_places.values())))))
     for name, words, directions in rows:
         by_point = dict(zip(network.known_places, directions, strict=True))
         yield displace_points(run, name, "board", words, _displacements_of_targets(run, by_point))
+
+
+def _datum_words(found: Estimate) -> tuple[str, str]:
+    """Describe another datum of the points by its shifts, turns (degrees) and scale (1e-6)."""
+    rows = [(f"shifted by {{}} in {axis}", 1.0) for axis in "XYZ"]
+    rows += [(f"turned by {{}} degrees about {axis}", float(np.degrees(1.0))) for axis in "XYZ"]
+    rows.append(("{} · 10⁻⁶ larger", 1e6))
+    values = zip(rows, -found.value, found.sigma, strict=True)
+    changes = [
+        words.format(f"{unit * v:+.4g} ± {unit * s:.1g}") for (words, unit), v, s in values if abs(v) > CLEAR * s
+    ]
+    return (
+        "The points and the orientations are given in two datums: the points are, about their centre, "
+        f"{', '.join(changes) or 'shifted'} against the orientations (points' unit)",
+        "Give both in one datum, or the orientations as approximations, without standard deviations.",
+    )
 
 
 def _bend_words(found: Estimate) -> tuple[str, str]:

@@ -154,8 +154,9 @@ def shifted_run(xyz: Array, xy_mm: Array, present: Mask) -> ShiftedRun | None:
         return None
     ends = min(run.low, run.low + run.shift), max(run.high, run.high + run.shift)
     reach = step + MOST_SHIFTED
+    first, last = (range(end - reach, end + reach + 1) for end in ends)
     # A row that stands twice fits in the run and beyond it.
-    return best_run(run.shift, product(*(range(end - reach, end + reach + 1) for end in ends)), AS_GOOD)
+    return best_run(run.shift, product(first, last), AS_GOOD)
 
 
 def exchanged_fiducials(network: Network) -> dict[str, str]:

@@ -110,7 +110,7 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
         adjustment, uncorrected = _correct_eccentricity(project, first, options)
     alike = _alike_names(project, marks)
     remarks = (*adjustment.remarks, *left_out, *bend_remarks, *misnamed, *alike, *uncorrected)
-    return replace(adjustment, unmodelled_mm=first.unmodelled_mm, remarks=remarks, unused=notes)
+    return replace(adjustment, unmodelled_mm=first.unmodelled_mm, remarks=remarks, unused=(*adjustment.unused, *notes))
 
 
 def adjustment_options(settings: AdjustSettings) -> Options:

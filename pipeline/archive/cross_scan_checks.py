@@ -13,7 +13,7 @@ from pipeline.archive.results_database import ResultsDatabase
 from pipeline.archive.work import Work
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
-from pipeline.measuring.camera_identification import add_plates
+from pipeline.measuring.camera_identification import add_plates, fitting_cameras
 from pipeline.measuring.repeated_views import check_repeated_views
 from pipeline.measuring.roll import check_scans, name_roll, note_same_frames
 from pipeline.measuring.scan_task import ScanTask
@@ -60,8 +60,12 @@ def check_lots(
     for of_cameras in _lots(project, own):
         some = [task for _, each in of_cameras for task in each]
         of_writing = [remarks[task.name] for task in some if task.name in remarks]
-        cameras = [camera for camera, _ in of_cameras]
-        depends_on = [cameras, project.film, of_writing, _project_inputs(project, some, input_hash)]
+        depends_on = [
+            list(project.cameras.values()),
+            project.film,
+            of_writing,
+            _project_inputs(project, some, input_hash),
+        ]
         yield lot(some, depends_on, partial(checked_lot, of_cameras))
     if copies:
         again = sorted(copies.items())
@@ -138,7 +142,11 @@ def _check_camera(
 ) -> tuple[MeasuredScan, ...]:
     """Second step of the measurement. Scans whose marks get other names by it are measured again."""
     scans = name_roll(tasks, [work.read(task.name) for task in tasks], camera.writing, work.measure)
-    checked = check_scans(camera, scans, project.film)
+    others = fitting_cameras(camera, scans, project.cameras, project.film.sigma_mm)
+    checked = [
+        scan.changed(problems=[others[scan.frame.image]]) if scan.frame.image in others else scan
+        for scan in check_scans(camera, scans, project.film)
+    ]
     is_board = project.targets is not None and project.targets.board is not None
     return tuple(check_repeated_views(checked, is_board, work.picture))
 

@@ -10,11 +10,13 @@ import cv2
 import numpy as np
 from rich.console import Console
 from rich.padding import Padding
+from scipy.special import chdtrc
 
 from measure.annotations.lines import CAMERA, Line, find_fields
 from measure.flags import Code, Reason
 from measure.marks.rendering import known_picture
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polygon
+from measure.results import MarkMeasurement
 from pipeline.files.camera_file import CameraFile
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import counted
@@ -29,6 +31,9 @@ _ALIKE = (
     0.75  # correlation: above it, drawings must be compared by eye; the variants of the K-17's wings have 0.8 to 0.93
 )
 
+_FEWEST_FIDUCIALS = 4  # with residuals under an affine transformation
+_FITS, _FITS_NOT = 0.05, 1e-4  # p-values of the camera that fits and, of all scans together, of one that does not
+_USUAL = 2.5  # variance over the median of the smaller of two chi-squares with a few degrees of freedom
 _OUTSTANDING = 2.0  # ratio to the score of the stretched layout
 CLOSE = 0.85  # fraction of the best score: cameras above it are not distinguished from the best
 _SHRUNK = 0.03  # relative scale error: more than film shrinkage and differences between cameras of one model
@@ -98,6 +103,52 @@ def add_plates(
             )
         added.append(scan.changed(None, [Reason(each, Code.PLATE) for each in problems], notes))
     return added
+
+
+def fitting_cameras(
+    camera: CameraFile, scans: Sequence[MeasuredScan], cameras: Mapping[str, CameraFile], film_mm: float
+) -> dict[str, Reason]:
+    """Find scans of one camera whose fiducials fit another camera of the project and not their own, by image.
+
+    The misfits of an affine transformation are tested with the standard deviations of marks, film and certificate,
+    enlarged by what is usual for the scans under the better camera.
+    """
+    ids = {each.id for each in camera.fiducials}
+    others = {name: each for name, each in cameras.items() if each is not camera}
+    rivals = {name: each for name, each in others.items() if {one.id for one in each.fiducials} == ids}
+    misfits = dict[str, tuple[int, dict[str, tuple[float, float]]]]()
+    for scan in scans if rivals else ():
+        marks = [mark for mark in scan.frame.marks if mark.kind == "fiducial" and mark.status.is_observation]
+        if len(marks) >= _FEWEST_FIDUCIALS:
+            own = {name: _misfit(marks, each, film_mm) for name, each in {"": camera, **rivals}.items()}
+            misfits[scan.frame.image] = 2 * len(marks) - 6, own
+    usual = [min(square for square, _ in own.values()) / freedom for freedom, own in misfits.values()]
+    scale, found = max(1.0, _USUAL * float(np.median(usual or [1.0]))), dict[str, Reason]()
+    for image, (freedom, own) in misfits.items():
+        best = min(own, key=lambda name: own[name][0])
+        fits_own, fits_best = (float(chdtrc(freedom, own[name][0] / scale)) for name in ("", best))
+        if fits_own < _FITS_NOT / len(misfits) and fits_best > _FITS:
+            sentence = (
+                f"its fiducials fit the camera {best} to {own[best][1]:.2g} µm and its own, {camera.name}, to "
+                f"{own[''][1]:.2g} µm: it is probably a frame of that one. Correct the column camera of images.csv, or "
+                "what sorts the scans by camera."
+            )
+            found[image] = Reason(sentence, Code.OTHER_CAMERA)
+    return found
+
+
+def _misfit(marks: Sequence[MarkMeasurement], camera: CameraFile, film_mm: float) -> tuple[float, float]:
+    """Chi-square of what an affine transformation leaves of a camera's fiducials, and its rms in µm."""
+    given = {each.id: each for each in camera.fiducials}
+    places_mm = np.array([given[mark.point].xy_mm for mark in marks])
+    pixels = np.array([[1.0, *np.asarray(mark.center_px)] for mark in marks])
+    by_pixels = np.linalg.lstsq(pixels, places_mm, rcond=None)[0]
+    rest_mm = places_mm - pixels @ by_pixels
+    pitch_mm2 = abs(float(np.linalg.det(by_pixels[1:])))
+    of_marks = [np.trace(mark.covariance.px2) / 2.0 for mark in marks if mark.covariance is not None]
+    given_mm2 = [np.mean(np.square(given[mark.point].sigma_mm)) for mark in marks]
+    variance_mm2 = film_mm**2 + pitch_mm2 * float(np.mean(of_marks)) + float(np.mean(given_mm2))
+    return float((rest_mm**2).sum()) / variance_mm2, 1000.0 * float(np.sqrt(np.mean(rest_mm**2)))
 
 
 # Cameras with solid marks (wings, notches, arrows) that resemble those of others: a scan hardly distinguishes them.

@@ -18,7 +18,7 @@ from adjust.problem.problem import number_reduced
 from adjust.quality.critical_values import Probabilities
 from adjust.solution.adjustment import adjust_unmodelled
 from adjust.solution.explanations import explain
-from adjust.solution.model_hypotheses import film_deformations
+from adjust.solution.model_hypotheses import film_deformations, model_hypotheses
 from adjust.solution.result import adjust_problem
 
 QUICK = (
@@ -46,6 +46,8 @@ QUICK = (
     "noise too small",
 )
 SOUND = faults.MISFITS[faults.NOTHING]
+
+Array = NDArray[np.float64]
 
 
 @pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.study)], ids=["board", "deep field"])
@@ -96,6 +98,28 @@ def test_an_estimated_noise_does_not_hide_pictures_that_moved(seed: int) -> None
     effects, rng = faults.Effects(motion=0.01), np.random.default_rng([seed, 1])
     result = adjust_unmodelled(faults.misfit_network(faults.scene(seed, flat=True), effects, SOUND, rng))
     assert [each.kind for each in result.explanations] == ["affinities"]
+
+
+def test_affinities_of_seventy_images_own_are_tried_with_unknowns_of_these() -> None:
+    """They were tried up to 60 images, by unknowns that all images had in common."""
+    scenes = [faults.scene(seed, flat=True) for seed in range(4, 20)]
+    first, of_all = scenes[0], [(each, k) for each in scenes for k in range(len(each.stations))][:70]
+    off = [first.points.mean(axis=0) - each.points.mean(axis=0) for each, _ in of_all]
+    made = replace(
+        first,
+        rotations=np.array([each.rotations[k] for each, k in of_all]),
+        stations=np.array([each.stations[k] + shift for (each, k), shift in zip(of_all, off, strict=True)]),
+        groups=np.zeros(70),
+    )
+    result = adjust(faults.misfit_network(made, faults.Effects(motion=0.01), SOUND, np.random.default_rng(1)))
+    (moved,) = (each for each in model_hypotheses(result.run, True, False) if each.kind == "affinities")
+    assert len(moved.added) == 2 * 70
+    assert (moved.problem.unknowns.sigma[moved.added] == np.inf).all()
+    at = result.run.linearised(moved.problem)
+    assert at is not None
+    # Nearly all that exceeds the noise, and its share of the noise.
+    assert result.vpv - at.factor.length() ** 2 == pytest.approx(result.redundancy - 140, rel=0.1)
+    assert result.vpv > 2.0 * result.redundancy
 
 
 @parametrize_with_studies("seed", [4, 5, 6, 7], quick=(0, 3))
@@ -397,10 +421,121 @@ def test_one_picture_under_two_names_is_named(apart_um: float, is_named: bool) -
     assert ["copy as im02" in each for each in result.warnings] == [True] * is_named
 
 
-def test_standard_deviations_in_another_unit_are_refused() -> None:
+@pytest.mark.parametrize("times", [1000.0, 1e-4])
+def test_standard_deviations_in_another_unit_are_refused(times: float) -> None:
     given = faults.misfit_network(faults.scene(6, flat=True), faults.Effects(), SOUND, None)
     with pytest.raises(AdjustmentError, match="another unit"):
-        adjust(nets.set_observations(given, covariance_mm2=1e6 * given.observations.covariance_mm2))
+        adjust(nets.set_observations(given, covariance_mm2=times**2 * given.observations.covariance_mm2))
+
+
+def test_standard_deviations_of_points_in_m_for_mm_are_named_with_the_factor() -> None:
+    """Three single coordinates were called suspect: the points, held, have no redundancy that tells."""
+    given = faults.blunder_network(2)
+    result = adjust(faults.change_points(given, lambda xyz: xyz, 1e-3))
+    assert [each.kind for each in result.explanations] == ["noise"]
+    assert result.suspects == ()
+    words = re.search(
+        r"given to the object points are too small everywhere, by a factor of ([\d.e+]+)",
+        result.warnings[0] if result.warnings else result.explanations[0].cause,
+    )
+    assert words
+    assert float(words[1]) == pytest.approx(1000.0, rel=0.2)
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_points_in_another_datum_than_observed_orientations_are_named(axis: int) -> None:
+    """Sheared points and too small standard deviations were told, or kappa of every image called suspect."""
+    given, turn = faults.blunder_network(1, faults.EXACT), np.radians(0.1) * np.eye(3)[axis]
+    turned = faults.change_points(given, lambda xyz: xyz + np.cross(turn, xyz))
+    (found,) = adjust(turned).explanations
+    words = re.search(r"turned by ([-+.\d]+) ± ([.\d]+) degrees about (.)", found.cause)
+    assert words
+    assert found.cause.startswith("The points and the orientations are given in two datums")
+    assert words[3] == "XYZ"[axis]
+    assert abs(float(words[1]) - 0.1) < 4.0 * float(words[2]) < 0.03
+    assert found.sigma0[1] == pytest.approx(1.0, abs=0.15)
+    assert adjust(given).explanations == ()
+
+
+@pytest.mark.parametrize(("heights", "plan"), [("none", "observed"), ("none", "approximate"), ("approximate", "none")])
+@pytest.mark.parametrize("factor", [1000.0, 1.0 / 0.3048])
+def test_heights_in_another_unit_are_named_by_stations_or_plan_coordinates(
+    factor: float, heights: str, plan: str
+) -> None:
+    """Approximations were silent; with observed stations points were said not to be found, or to be noisy."""
+    oriented = {"observed": faults.EXACT, "approximate": faults.APPROXIMATE, "none": None}[plan]
+    given = faults.blunder_network(1, oriented)
+    spread = {"none": None, "approximate": np.inf}[heights]
+    points = []
+    for point in given.points:
+        x, y, z = (prior for prior in point.priors if prior)
+        in_plan = [None if spread is None else replace(prior, sigma=spread) for prior in (x, y)]
+        points.append(replace(point, X=in_plan[0], Y=in_plan[1], Z=Prior(factor * z.value, factor * z.sigma)))
+    words = (
+        f"{factor:.4g} times too large for the {'approximate X and Y' if plan == 'none' else 'stations or distances'}"
+    )
+    options = Options(datum="minimal")
+    sentences = []
+    try:
+        sentences = list(adjust(replace(given, points=tuple(points)), options=options).warnings)
+    except AdjustmentError as error:
+        sentences = [str(error)]
+    assert [words in each for each in sentences] == [True]
+
+
+def _rows_of_images(network: Network) -> list[Array]:
+    return [image.exterior.values for image in network.images if image.exterior]
+
+
+def _with_rows_of_images(given: Network, change: Callable[[list[Array]], None]) -> Network:
+    rows = [row.copy() for row in _rows_of_images(given)]
+    change(rows)
+    changed = zip(given.images, rows, strict=True)
+    exteriors = {image.name: replace(image.exterior, values=row) for image, row in changed if image.exterior}
+    return nets.orient(given, exteriors)
+
+
+def _moved(rows: list[Array]) -> None:
+    rows[1][:2] += (900.0, -600.0)
+
+
+def _turned(rows: list[Array]) -> None:
+    rows[1][3:] = rows[2][3:]
+
+
+@pytest.mark.parametrize(("change", "words"), [(_moved, "X0 = "), (_turned, "kappa = ")])
+def test_a_wrong_row_of_observed_orientations_is_named_with_both_values(
+    change: Callable[[list[Array]], None], words: str
+) -> None:
+    """The image had been left out, or fiducials and targets were called suspect beside the row."""
+    given = faults.blunder_network(1, faults.EXACT)
+    spoilt = _with_rows_of_images(given, change)
+    with pytest.raises(
+        AdjustmentError, match=rf"given for 1 of 4 images contradict their marks \(f1: {words}"
+    ) as error:
+        adjust(spoilt)
+    values = re.findall(rf"{words}([-.\de]+) is found as ([-.\de]+)", str(error.value))[0]
+    k, unit = (0, 1.0) if change is _moved else (5, np.degrees(1.0))
+    assert float(values[0]) == pytest.approx(unit * _rows_of_images(spoilt)[1][k], rel=1e-5)
+    assert float(values[1]) == pytest.approx(unit * _rows_of_images(given)[1][k], rel=0.01)
+
+
+@pytest.mark.parametrize(("change", "words"), [(_moved, "f1: the station"), (_turned, "f1: omega, phi, kappa")])
+def test_a_wrong_row_of_approximate_orientations_is_a_note_with_both_values(
+    change: Callable[[list[Array]], None], words: str
+) -> None:
+    given = faults.blunder_network(1, faults.APPROXIMATE)
+    assert adjust(given).notes == ()
+    result = adjust(_with_rows_of_images(given, change))
+    assert result.warnings == ()
+    (note,) = result.notes
+    assert (
+        f"given approximately for 1 of 4 images are far from those found, which do not depend on them: {words}" in note
+    )
+    found = [float(each) for each in re.findall(r"(?:found at|as) \(([^)]*)\)", note)[0].split(", ")]
+    row = _rows_of_images(given)[1]
+    truth, abs_error = (row[:3], 60.0) if change is _moved else (np.degrees(row[3:]), 5.0)
+    assert found == pytest.approx(truth, abs=abs_error)
 
 
 def sound(frame_mm: tuple[float, float] = (12.8, 9.6)) -> Network:
@@ -487,8 +622,6 @@ def test_images_that_point_straight_at_a_board_are_named() -> None:
             )
         )
 
-
-Array = NDArray[np.float64]
 
 WRONG = 5
 STOPPED = 15  # steps: those that find no minimum in a hundred need not take them all

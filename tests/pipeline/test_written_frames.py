@@ -1,5 +1,6 @@
 """What is written on the frames, through the files: frames.csv, images.csv, the camera's file, a roll's poses."""
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,8 +20,16 @@ from measure.marks.shapes import Side, WrittenPlace
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
 from pipeline import read_measurement
 from pipeline.files.camera_file import CameraFile, camera_text, parse_camera, read_camera
+from pipeline.files.library import library_path
 from pipeline.files.object_files import WRITTEN, fill_images, read_images
-from pipeline.measuring.camera_identification import Identification, Trial, add_plates, contradictions, parse_plate
+from pipeline.measuring.camera_identification import (
+    Identification,
+    Trial,
+    add_plates,
+    contradictions,
+    fitting_cameras,
+    parse_plate,
+)
 from pipeline.measuring.roll import add_known_lines, known_lines, note_same_frames, poses_of_roll
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.progress import Reporter
@@ -50,6 +59,47 @@ def plated(camera: CameraFile, cameras: Mapping[str, CameraFile], **lines: Seque
     """Scans with these lines, held against their camera's file."""
     texts = {image: None if own is None else [line(text) for text in own] for image, own in lines.items()}
     return list(add_plates(camera, [scan(image, own) for image, own in texts.items()], cameras))
+
+
+def fiducial_scans(cameras: Sequence[CameraFile], apart_mm: float, seed: int = 1) -> list[MeasuredScan]:
+    """Scans of frames of some cameras, on affine film that scatters by some mm, at 20 µm a pixel."""
+    rng, scans = np.random.default_rng(seed), []
+    for number, camera in enumerate(cameras):
+        places = np.array([each.xy_mm for each in camera.fiducials])
+        film = np.eye(2) + rng.normal(0.0, 3e-4, (2, 2))
+        centers = (places + rng.normal(0.0, apart_mm, places.shape)) @ film.T / 0.02 * [1.0, -1.0] + 6000.0
+        covariance = Covariance({Cause.NOISE: 0.05**2 * np.eye(2)})
+        marks = tuple(
+            MarkMeasurement(each.id, "fiducial", center, covariance, Status.MEASURED)
+            for each, center in zip(camera.fiducials, centers, strict=True)
+        )
+        scans.append(MeasuredScan(f"s{number}.tif", 100, 100, (20.0, 20.0), FrameMeasurement(f"s{number}", marks)))
+    return scans
+
+
+def test_scans_whose_fiducials_fit_another_camera_of_the_project_are_named() -> None:
+    own = read_camera(library_path("wild-rc8-eight-153"))
+    rng, film_mm = np.random.default_rng(3), 0.005
+    moved = tuple(replace(each, xy_mm=tuple(rng.normal(each.xy_mm, 0.05))) for each in own.fiducials)
+    other = replace(own, name="another", fiducials=moved)
+    cameras = {"own.toml": own, "other.toml": other}
+    for wrong in ((), (1,), (0, 1, 2, 3)):
+        scans = fiducial_scans([other if k in wrong else own for k in range(4)], film_mm)
+        found = fitting_cameras(own, scans, cameras, film_mm)
+        assert found.keys() == {f"s{k}" for k in wrong}
+        for reason in found.values():
+            assert "fit the camera other.toml to" in reason
+            misfits_um = [float(each) for each in re.findall(r"to ([\d.]+) µm", reason)]
+            assert misfits_um[0] == pytest.approx(1000.0 * film_mm, rel=0.6)
+            assert misfits_um[1] == pytest.approx(50.0, rel=0.6)
+    # Film that scatters more than is believed fits no camera better; four marks have residuals of one pattern alone.
+    rng = np.random.default_rng(2)
+    near = tuple(replace(each, xy_mm=tuple(rng.normal(each.xy_mm, 0.03))) for each in own.fiducials[:4])
+    own, other = replace(own, fiducials=own.fiducials[:4]), replace(other, fiducials=near)
+    cameras = {"own.toml": own, "other.toml": other}
+    for seed in range(50):
+        assert not fitting_cameras(own, fiducial_scans([own] * 8, 8.0 * film_mm, seed), cameras, film_mm)
+        assert not fitting_cameras(own, fiducial_scans([own] * 8, film_mm, seed), cameras, film_mm)
 
 
 def test_frames_csv_has_every_line_with_what_it_says(tmp_path: Path) -> None:
