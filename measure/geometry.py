@@ -2,15 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from measure.array_types import Array, Mask
 
 Grid = TypeVar("Grid", Array, Mask)
-
+Complex = NDArray[np.complexfloating[Any, Any]]
 
 POSES = ("0", "90", "180", "270", "0m", "90m", "180m", "270m")
 
@@ -59,6 +59,30 @@ class Affine:
 def linear_scale(matrix: Array) -> float:
     """Mean scale, as in `Affine.scale`, of a linear part (2, 2) or of the first columns of a matrix (2, 3)."""
     return float(np.sqrt(abs(np.linalg.det(matrix[:, :2]))))
+
+
+def scan_px(reduced_px: Array, factor: float) -> Array:
+    """Convert pixels (..., 2) of a scan reduced by a factor to pixels of the scan; the centre of a pixel is whole."""
+    return np.asarray(reduced_px * factor + (factor - 1) / 2)
+
+
+def reduced_px(scan_px: Array, factor: float) -> Array:
+    """Convert pixels (..., 2) of a scan to pixels of the scan reduced by a factor."""
+    return np.asarray((scan_px - (factor - 1) / 2) / factor)
+
+
+def fit_similarity(from_: Complex, to: Complex, weight: Array) -> tuple[Complex, Complex]:
+    """Fit similarities a w + b to weighted places (..., n), complex numbers. Returns a and b, (...,) each."""
+    total = weight.sum(axis=-1)
+    mean_from, mean_to = ((weight * places).sum(axis=-1) / total for places in (from_, to))
+    reduced, target = from_ - mean_from[..., None], to - mean_to[..., None]
+    scale = (weight * np.conj(reduced) * target).sum(axis=-1) / (weight * np.abs(reduced) ** 2).sum(axis=-1)
+    return scale, mean_to - scale * mean_from
+
+
+def similarity_matrix(scale: complex | Complex, offset: complex | Complex) -> Array:
+    """(2, 3) matrix of a similarity a w + b of complex numbers."""
+    return np.array([[scale.real, -scale.imag, offset.real], [scale.imag, scale.real, offset.imag]])
 
 
 def _up_from_camera(pose: str) -> Array:

@@ -73,6 +73,11 @@ class Covariance:
         return "Covariance(" + ", ".join(f"{cause} {sigma:.3g} px" for cause, sigma in self.sigmas_px.items()) + ")"
 
 
+def largest_sigma_px(covariance_px2: Array) -> float:
+    """Standard deviation in the direction in which it is largest: semi-major axis of the error ellipse (2, 2)."""
+    return float(np.sqrt(np.linalg.eigvalsh(covariance_px2)[-1]))
+
+
 @dataclass(frozen=True, repr=False)
 class MarkMeasurement:
     """Measurement of one mark in one scan.
@@ -111,6 +116,10 @@ class MarkMeasurement:
 
     def __repr__(self) -> str:
         return f"MarkMeasurement({self.kind} {' '.join(cell for cell in self.cells() if cell)})"
+
+    def reject(self, reason: Reason) -> "MarkMeasurement":
+        """Reject an observation for a reason; any other mark stays."""
+        return replace(self, status=Status.REJECTED, reason=reason) if self.status.is_observation else self
 
     def cells(self) -> tuple[str, str, str, str, str]:
         """Name, status, place, standard deviations and reason as text; empty where not available."""

@@ -84,15 +84,12 @@ def networks() -> Networks | None:
         return None
     contents = [file.read_bytes() for file in files]
     detection, recognition = (cv2.dnn.readNetFromONNX(np.frombuffer(content, np.uint8)) for content in contents)
-    return Networks(detection, recognition, _characters(contents[1]))
-
-
-def _characters(model: bytes) -> tuple[str, ...]:
-    """Characters that the network tells apart, from the metadata of its ONNX file, which OpenCV gives no access to."""
-    length = re.compile(_CHARACTERS + rb"([\x80-\xff]*[\0-\x7f])").search(model)
+    # The characters are in the metadata of the ONNX file, to which OpenCV gives no access.
+    length = re.compile(_CHARACTERS + rb"([\x80-\xff]*[\0-\x7f])").search(contents[1])
     assert length is not None
     size = sum((byte & 127) << 7 * place for place, byte in enumerate(length[1]))  # a protocol-buffer varint
-    return "", *model[length.end() : length.end() + size].decode().split("\n"), " "
+    characters = contents[1][length.end() : length.end() + size].decode().split("\n")
+    return Networks(detection, recognition, ("", *characters, " "))
 
 
 @dataclass(frozen=True)
@@ -106,11 +103,8 @@ class Place:
 
     def outline_px(self) -> Array:
         """(4, 2) corners, clockwise from the start of the line."""
-        angle = np.deg2rad(self.tilt_deg)
-        along, down = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
-        half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2.0
-        corners = half[:, :1] * self.length_px * along + half[:, 1:] * self.height_px * down
-        return np.asarray(corners + self.center_px)
+        rectangle = self.center_px, (self.length_px, self.height_px), self.tilt_deg
+        return np.roll(np.asarray(cv2.boxPoints(rectangle), float), -1, axis=0)
 
     def scaled(self, factor: float) -> "Place":
         """The place in an image that is enlarged by a factor."""

@@ -20,6 +20,7 @@ from measure.boards.specs import (
     SquareGridSpec,
 )
 from measure.flags import NO_REASON, Code, Reason
+from measure.geometry import reduced_px, scan_px
 from measure.scans.scan import Scan
 from measure.targets.sheets import fit_view_robustly
 
@@ -333,11 +334,11 @@ def _drawn_chessboard_grid(picture: Bytes, spec: ChessboardSpec, flags: int, dra
 def _other_chessboards(scan: Scan, found: FoundBoard, spec: ChessboardSpec, factor: int) -> tuple[Array, ...]:
     """Centres of further chessboards in the scan reduced by a factor, in which a smaller one shows; each is painted
     over before the next one is searched."""
-    picture, offset = _searchable(scan, factor)[0].copy(), (factor - 1) / 2
+    picture = _searchable(scan, factor)[0].copy()
     background = int(np.median(picture[::4, ::4]))
     corners = np.array([corner.center_px for corner in found.corners.values()])
     steps = np.array([corner.steps_px for corner in found.corners.values()])
-    centers, steps, others = (corners - offset) / factor, steps / factor, list[Array]()
+    centers, steps, others = reduced_px(corners, factor), steps / factor, list[Array]()
     while True:
         around = centers[:, None] + np.einsum("nij,kj->nki", steps, [(-1, -1), (1, -1), (1, 1), (-1, 1)])
         hull = cv2.convexHull(around.reshape(-1, 2).astype(np.float32))
@@ -347,7 +348,7 @@ def _other_chessboards(scan: Scan, found: FoundBoard, spec: ChessboardSpec, fact
         grid = _drawn_chessboard_grid(picture, spec, _THOROUGHLY, _DRAWINGS)
         if grid is None:
             return tuple(others)
-        others.append(grid.mean(axis=(0, 1)) * factor + offset)
+        others.append(scan_px(grid.mean(axis=(0, 1)), factor))
         centers = grid.reshape(-1, 2)
         steps = _grid_steps(grid).reshape(-1, 2, 2)
 
@@ -388,12 +389,11 @@ def _find_reduced(
         found = find_chessboard(picture, spec, is_quick)
     else:
         found = find_squares(picture, spec) if isinstance(spec, SquareGridSpec) else _find_markers(picture, spec)
-    offset = (factor - 1) / 2  # pixel (i, j) of a reduced image has its centre at factor j + (factor - 1) / 2
     corners = {
-        name: FoundCorner(corner.center_px * factor + offset, corner.steps_px * factor)
+        name: FoundCorner(scan_px(corner.center_px, factor), corner.steps_px * factor)
         for name, corner in found.corners.items()
     }
-    return replace(found, corners=corners, others_px=tuple(one * factor + offset for one in found.others_px))
+    return replace(found, corners=corners, others_px=tuple(scan_px(one, factor) for one in found.others_px))
 
 
 def _find_markers(picture: Bytes, spec: ArucoSpec | CharucoSpec) -> FoundBoard:

@@ -185,11 +185,7 @@ def _unless_alone(scan: Scan, measured: BoardMeasurement, kind: str, others_px: 
     places = " and ".join(f"({column:.0f}, {row:.0f})" for column, row in in_file)
     message = f"the scan shows {1 + len(others_px)} {kind}, about the pixels {places}, and nothing tells which is meant"
     why = Reason(f"{message}: cover the others", Code.AMBIGUOUS)
-    marks = tuple(
-        replace(mark, status=Status.REJECTED, reason=why) if mark.status.is_observation else mark
-        for mark in measured.marks
-    )
-    return replace(measured, marks=marks, ambiguous=why)
+    return replace(measured, marks=tuple(mark.reject(why) for mark in measured.marks), ambiguous=why)
 
 
 def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) -> dict[str, Corner]:

@@ -12,6 +12,7 @@ from scipy.special import ndtr
 from measure.array_types import Array
 from measure.detection.correlation import WIDE, Surroundings, correlation, highest_about
 from measure.flags import NOISE_LIKE_A_MARK
+from measure.geometry import reduced_px, scan_px
 from measure.marks.rendering import detail_px, extent_px, known_picture, mark_window
 from measure.marks.shapes import Mark
 from measure.matching.window import FAINT
@@ -88,7 +89,7 @@ class _PeakSearch:
     def __init__(self, scan: Scan, expected: MarkPrediction, blur_px: float) -> None:
         mark, surroundings = expected.mark, expected.surroundings
         reduction = 2 if detail_px(mark, expected.linear) >= _HALVED_PX else 1
-        reduced = np.column_stack([expected.linear, expected.center_px - (reduction - 1) / 2]) / reduction
+        reduced = np.column_stack([expected.linear / reduction, reduced_px(expected.center_px, reduction)])
         search_px, blur_px = expected.search_px / reduction, blur_px / reduction
         spare = int(np.ceil(2 * blur_px))
         centred = np.column_stack([reduced[:, :2], np.zeros(2)])
@@ -115,7 +116,7 @@ class _PeakSearch:
         self._places = int(near.sum())
         # A sub-pixel start saves the fit one step.
         top = highest_about(response, np.array([self._best[::-1]]), 0.0)[0][0]
-        self.center_px: Array = (top + first) * reduction + (reduction - 1) / 2
+        self.center_px: Array = scan_px(top + first, reduction)
         self.height = float(response[self._best])
 
     @cached_property

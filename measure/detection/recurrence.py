@@ -5,16 +5,15 @@ at one place only. The mark is therefore the square whose best match in other fr
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
-from scipy import ndimage
 
 from measure.array_types import Array, Single
 from measure.detection.correlation import WIDE
 from measure.geometry import linear_scale
+from measure.marks.templates import cut, resample_chip
 from measure.matching.window import FAINT
 from measure.scans.scan import Scan
 
@@ -39,19 +38,15 @@ class Recurrence:
 def resample_square(scan: Scan, pixel_from_camera: Array, xy_mm: Array, size_mm: float, reach_mm: float) -> Window:
     """Resample the square around a place of the frame to the camera's axes (x right, y up), _SIDE samples per size_mm,
     with the background subtracted."""
-    pitch_mm = size_mm / _SIDE
+    pitch_mm, linear = size_mm / _SIDE, pixel_from_camera[:, :2]
     half = int(np.ceil((size_mm / 2 + reach_mm) / pitch_mm))
-    step = np.arange(-half, half + 1) * pitch_mm
-    linear = pixel_from_camera[:, :2]
-    reach = int(np.ceil(np.abs(linear).sum(axis=1).max() * half * pitch_mm)) + 2
-    center = linear @ xy_mm + pixel_from_camera[:, 2]
-    col0, row0 = (int(value) - reach for value in np.rint(center))
-    grey = scan.window(col0, row0, 2 * reach + 1, 2 * reach + 1)
-    fine = cv2.GaussianBlur(grey, (0, 0), max(0.5 * pitch_mm * linear_scale(linear), 0.3))
-    col, row = np.tensordot(linear, np.stack(np.meshgrid(step, -step)), axes=1) + (center - (col0, row0)).reshape(
-        2, 1, 1
+    place = np.column_stack([linear, linear @ xy_mm + pixel_from_camera[:, 2]])
+    chip = cut(scan, place, 2 * half * pitch_mm)
+    fine = cv2.GaussianBlur(chip.grey, (0, 0), max(0.5 * pitch_mm * linear_scale(linear), 0.3))
+    resampled = resample_chip(
+        replace(chip, grey=np.asarray(fine, float)), place, 2 * half + 1, 1000 * pitch_mm, order=1
     )
-    sampled = ndimage.map_coordinates(fine, [row, col], order=1, mode="nearest").astype(np.float32)
+    sampled = resampled.astype(np.float32)
     return WIDE.flattened(sampled, _DETAIL, scan.full_scale_dn * FAINT)
 
 
@@ -60,23 +55,24 @@ def recurrence(reference: Window, others: Sequence[Window], size_mm: float) -> R
     recurring structure gives the most precise place."""
     span = reference.shape[0] - _SIDE
     tried = [(row, col) for row in range(0, span + 1, _STEP) for col in range(0, span + 1, _STEP)]
-    excess = [_excess(reference[row : row + _SIDE, col : col + _SIDE], others) for row, col in tried]
+    excess = [_peak_excess(reference[row : row + _SIDE, col : col + _SIDE], others) for row, col in tried]
     best = int(np.argmax(excess))
     row, col = tried[best]
     square = reference[row : row + _SIDE, col : col + _SIDE]
     aligned = [reference]
     for window in others:
-        own_row, own_col = _highest(cv2.matchTemplate(window, square, cv2.TM_CCOEFF_NORMED))
+        response = np.asarray(cv2.matchTemplate(window, square, cv2.TM_CCOEFF_NORMED))
+        own_row, own_col = np.unravel_index(response.argmax(), response.shape)
         shift = np.array([[1.0, 0.0, col - own_col], [0.0, 1.0, row - own_row]], np.float32)
         moved = cv2.warpAffine(window, shift, window.shape[::-1], flags=cv2.INTER_NEAREST)
         aligned.append(np.asarray(moved, np.float32))
-    center_row, center_col = _telling(np.stack(aligned), (row, col))
+    center_row, center_col = _most_informative_place(np.stack(aligned), (row, col))
     middle = (reference.shape[0] - 1) / 2
     offset = np.array([center_col - middle, middle - center_row]) * size_mm / _SIDE
     return Recurrence(offset, float(excess[best]))
 
 
-def _telling(stack: Window, square: tuple[int, int]) -> tuple[int, int]:
+def _most_informative_place(stack: Window, square: tuple[int, int]) -> tuple[int, int]:
     """Row and column within the square at (row, col) around which the mean of aligned windows has the most information
     on a place in the weaker direction: squared gradients over the variance between frames."""
     mean = stack.mean(axis=0)
@@ -93,21 +89,15 @@ def _telling(stack: Window, square: tuple[int, int]) -> tuple[int, int]:
     return int(top[0]) + row, int(top[1]) + col
 
 
-def _excess(square: Window, windows: Sequence[Window]) -> float:
+def _peak_excess(square: Window, windows: Sequence[Window]) -> float:
     """NCC of the best match in a window minus that of the second best, median over the windows."""
     if square.std() < 1e-3:
         return 0.0
     excesses = []
     for window in windows:
         rest = np.array(cv2.matchTemplate(window, square, cv2.TM_CCOEFF_NORMED), np.float32)
-        row, col = _highest(rest)
+        row, col = (int(each) for each in np.unravel_index(rest.argmax(), rest.shape))
         best = float(rest[row, col])
         rest[max(row - _APART, 0) : row + _APART + 1, max(col - _APART, 0) : col + _APART + 1] = -1.0
         excesses.append(best - max(float(rest.max()), 0.0))
     return float(np.median(excesses))
-
-
-def _highest(response: NDArray[np.generic]) -> tuple[int, int]:
-    values = np.asarray(response, np.float32)
-    row, col = divmod(int(values.argmax()), values.shape[1])
-    return row, col

@@ -319,14 +319,6 @@ class Responses:
         tops, heights = highest_about(self.maps[key], places - self.origin(key), radius_px)
         return tops + self.origin(key), heights
 
-    def reduced_px(self, scan_px: Array) -> Array:
-        """Convert scan pixels (..., 2) to pixels of the reduced scan."""
-        return np.asarray((scan_px - (self.reduction - 1) / 2) / self.reduction)
-
-    def scan_px(self, reduced_px: Array) -> Array:
-        """Convert pixels of the reduced scan (..., 2) to scan pixels."""
-        return np.asarray(reduced_px * self.reduction + (self.reduction - 1) / 2)
-
 
 def correlate_scan(
     scan: Scan,

@@ -437,7 +437,7 @@ def _misfit(
 def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) -> tuple[FramesExplanation, Reason]:
     """Explain the misfits by film and marks alone, wrong given coordinates or the scanner, with the problem."""
     given_mm = np.array([min(max(mark.sigma_mm), MOST_GIVEN_SIGMA_MM) for mark in layout.marks])
-    given = MisfitPattern(np.array([mark.xy_mm for mark in layout.marks]), given_mm)
+    given = MisfitPattern(layout.places_mm, given_mm)
     by_given = explain(frames, given, film_mm)
     if by_given.is_lone:
         return by_given, NO_REASON

@@ -18,6 +18,7 @@ from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import FrameSearch, PitchHypothesis
 from measure.fiducials.stages import false_placements
 from measure.flags import CAMERA_BY_NOISE, MAX_FALSE_CAMERAS
+from measure.geometry import scan_px
 from measure.marks.shapes import FiducialLayout
 from measure.matching.models import MatchOptions
 from measure.scans.scan import Scan
@@ -41,7 +42,7 @@ class Answer:
     placements: tuple[Placement, ...]
 
 
-def search_camera(scan: Scan, layout: FiducialLayout, hypotheses: Sequence[PitchHypothesis], tried: int = 0) -> Answer:
+def search_camera(scan: Scan, layout: FiducialLayout, hypotheses: Sequence[PitchHypothesis], tried: int) -> Answer:
     """Search a scan for the constellation of a camera, under pitch hypotheses. tried: number of earlier hypotheses."""
     options, tried = FiducialOptions(), tried + len(hypotheses)
     result = FrameSearch(scan, layout, options, _QUICK).search_room(options, hypotheses)
@@ -50,7 +51,7 @@ def search_camera(scan: Scan, layout: FiducialLayout, hypotheses: Sequence[Pitch
     return Answer(min(expected, default=np.inf), tuple(found))
 
 
-def recognise_frame(scan: Scan, layout: FiducialLayout, answered: Answer, times: float = 1.0) -> Frame | None:
+def recognise_frame(scan: Scan, layout: FiducialLayout, answered: Answer, times: float) -> Frame | None:
     """Detect the frame of a camera in the best placements; None if it is accepted in none.
 
     Parameters
@@ -59,8 +60,8 @@ def recognise_frame(scan: Scan, layout: FiducialLayout, answered: Answer, times:
     times : pixels of the scan for one pixel of the thumbnail, along a side.
     """
     for placement in answered.placements[:_PLACES]:
-        pixel_from_camera = times * placement.pixel_from_camera
-        pixel_from_camera[:, 2] += (times - 1) / 2
+        linear, shift = placement.pixel_from_camera[:, :2], placement.pixel_from_camera[:, 2]
+        pixel_from_camera = np.column_stack([times * linear, scan_px(shift, times)])
         enlarged = replace(
             placement,
             pixel_from_camera=pixel_from_camera,

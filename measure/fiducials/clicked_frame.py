@@ -10,7 +10,7 @@ from measure.fiducials.constellation import Placement
 from measure.fiducials.measure_frame import Frame, measure_frame
 from measure.fiducials.options import FiducialOptions
 from measure.flags import NO_REASON, Code, Reason
-from measure.geometry import POSES, UP_FROM_CAMERA, linear_scale
+from measure.geometry import POSES, UP_FROM_CAMERA, fit_similarity, linear_scale, similarity_matrix
 from measure.marks.shapes import FiducialLayout
 from measure.results import ScanOrientation
 from measure.scans.scan import Scan
@@ -74,13 +74,10 @@ def _clicked_pose(camera: Array, up_mm: Array, poses: Sequence[str]) -> tuple[st
     found = []
     for pose in poses:
         own, observed = camera @ UP_FROM_CAMERA[pose].T @ (1.0, 1j), up_mm @ (1.0, 1j)
-        design = np.column_stack([own, np.ones(len(own))])
-        (scale, shift), *_ = np.linalg.lstsq(design, observed, rcond=None)
-        linear = np.array([[scale.real, -scale.imag], [scale.imag, scale.real]]) @ UP_FROM_CAMERA[pose]
-        misfit_mm = float(np.abs(design @ (scale, shift) - observed).max())
-        turned = linear @ np.linalg.inv(UP_FROM_CAMERA[pose])
-        turn_rad = float(np.arctan2(turned[1, 0], turned[0, 0]))
-        up = np.column_stack([linear, [shift.real, shift.imag]])
-        found.append((round(misfit_mm / np.ptp(up_mm), 9), abs(turn_rad), pose, up))
+        scale, shift = fit_similarity(own, observed, np.ones(len(own)))
+        misfit_mm = float(np.abs(scale * own + shift - observed).max())
+        similarity = similarity_matrix(scale, shift)
+        up = np.column_stack([similarity[:, :2] @ UP_FROM_CAMERA[pose], similarity[:, 2]])
+        found.append((round(misfit_mm / np.ptp(up_mm), 9), abs(float(np.angle(scale))), pose, up))
     _, _, pose, up = min(found, key=itemgetter(0, 1))
     return pose, up

@@ -16,10 +16,16 @@ from measure.detection.correlation import WIDE, Surroundings
 from measure.detection.responses import Key, Responses
 from measure.fiducials.interior_orientation import FilmFit
 from measure.fiducials.options import TakingLens
-from measure.geometry import UP_FROM_CAMERA, linear_scale
-from measure.marks.shapes import LayoutMark, Mark
-
-Complex = NDArray[np.complex128]
+from measure.geometry import (
+    UP_FROM_CAMERA,
+    Complex,
+    fit_similarity,
+    linear_scale,
+    reduced_px,
+    scan_px,
+    similarity_matrix,
+)
+from measure.marks.shapes import LayoutMark, Mark, places_mm
 
 NARROW = 0.25  # fraction of the tolerance within which marks agree on film that is hardly deformed
 _LEAST_WEIGHED = 0.1  # response above which a mark has weight in the refinement of a placement
@@ -129,7 +135,7 @@ class Placement:
         pitch = np.array(self.pitch_mm)
         own, other = self._ideal_px(camera_mm), renamed._ideal_px(camera_mm)[names]
         to, from_ = ((each * pitch) @ (1.0, 1.0j) for each in (own, other))
-        correction = _similarity_matrix(*_fit_similarity(from_, to, np.ones(len(to))))
+        correction = similarity_matrix(*fit_similarity(from_, to, np.ones(len(to))))
         before = renamed.pixel_from_camera * pitch[:, None]
         linear, shift = correction[:, :2] @ before[:, :2], before[:, 2] @ correction[:, :2].T + correction[:, 2]
         return replace(renamed, pixel_from_camera=np.column_stack([linear, shift]) / pitch[:, None])
@@ -142,20 +148,6 @@ def distinct_places(found: Iterable[Placement], most: int) -> list[Placement]:
         if len(places) < most and not any(placement.same_place(other) for other in places):
             places.append(placement)
     return places
-
-
-def _fit_similarity(from_: Complex, to: Complex, weight: Array) -> tuple[Complex, Complex]:
-    """Similarities (...,) from weighted places (..., n), by least squares."""
-    total = weight.sum(axis=-1)
-    mean_from, mean_to = ((weight * places).sum(axis=-1) / total for places in (from_, to))
-    reduced, target = from_ - mean_from[..., None], to - mean_to[..., None]
-    scale = (weight * np.conj(reduced) * target).sum(axis=-1) / (weight * np.abs(reduced) ** 2).sum(axis=-1)
-    return scale, mean_to - scale * mean_from
-
-
-def _similarity_matrix(scale: complex | Complex, offset: complex | Complex) -> Array:
-    """(2, 3) matrix of a similarity."""
-    return np.array([[scale.real, -scale.imag, offset.real], [scale.imag, scale.real, offset.imag]])
 
 
 def lattice_steps_mm(camera_mm: Array, within_mm: float) -> Array:
@@ -172,7 +164,7 @@ def same_picture(
     marks: Sequence[LayoutMark], first: tuple[str, Sequence[int]], second: tuple[str, Sequence[int]], within_mm: float
 ) -> bool:
     """Whether two poses have equal marks at equal places. first, second: pose and kind of template of every mark."""
-    xy = np.array([mark.xy_mm for mark in marks])
+    xy = places_mm(marks)
     of_first, of_second = (xy @ UP_FROM_CAMERA[pose].T for pose, _ in (first, second))
     distance = np.hypot(*np.moveaxis(of_first[:, None] - of_second[None], -1, 0))
     nearest = distance.argmin(axis=1)
@@ -209,7 +201,7 @@ class PlacementSearch:
         lens: TakingLens | None = None,
     ) -> None:
         self.marks, self.responses, self.bounds, self.lens = marks, responses, bounds, lens
-        self.camera_mm = np.array([mark.xy_mm for mark in marks])
+        self.camera_mm = places_mm(marks)
         self.pitch_mm, self.pitch = pitch_mm, np.asarray(pitch_mm)
         self.steps_mm = lattice_steps_mm(self.camera_mm, bounds.misfit_mm)
         self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, _LEAST_TOLERANCE_PX)
@@ -278,7 +270,7 @@ class _Constellation:
         return [
             Placement(self.pose, per_mm * np.column_stack([up[:, :2] @ turn, up[:, 2]]), score, count, *settings)
             for up, score, count in zip(
-                map(_similarity_matrix, scale, offset), scores.tolist(), supported.tolist(), strict=True
+                map(similarity_matrix, scale, offset), scores.tolist(), supported.tolist(), strict=True
             )
         ]
 
@@ -294,15 +286,16 @@ class _Constellation:
             offset = tried[np.arange(len(best)), best]
         return scale[: len(best)], offset[: len(best)]
 
-    def _complex(self, reduced_px: Array) -> Complex:
-        scan_px, lens = self.responses.scan_px(reduced_px), self.search.lens
-        return np.asarray((scan_px if lens is None else lens.ideal_px(scan_px)) * self.search.pitch @ (1.0, -1.0j))
+    def _complex(self, reduced: Array) -> Complex:
+        """Convert places of the reduced scan to mm of the scan's axes."""
+        places, lens = scan_px(reduced, self.responses.reduction), self.search.lens
+        return np.asarray((places if lens is None else lens.ideal_px(places)) * self.search.pitch @ (1.0, -1.0j))
 
     def _reduced_px(self, scale: Complex, offset: Complex) -> Array:
         """(n, marks, 2) places of the marks in the reduced scan under similarities (n,)."""
         places, lens = scale[:, None] * self.camera + offset[:, None], self.search.lens
         ideal = np.asarray(np.stack([places.real, -places.imag], axis=-1) / self.search.pitch)
-        return self.responses.reduced_px(ideal if lens is None else lens.scan_px(ideal))
+        return reduced_px(ideal if lens is None else lens.scan_px(ideal), self.responses.reduction)
 
     def _hypotheses(self) -> tuple[Complex, Complex]:
         """All similarities within bounds through two marks and two of their candidates."""
@@ -350,7 +343,7 @@ class _Constellation:
             tops, heights = (np.stack(each, axis=1) for each in zip(*found, strict=True))
             weight = np.maximum(heights - _LEAST_WEIGHED, 0.0)
             moving &= (weight > 0).sum(axis=1) >= 2
-            scale[moving], offset[moving] = _fit_similarity(self.camera, self._complex(tops[moving]), weight[moving])
+            scale[moving], offset[moving] = fit_similarity(self.camera, self._complex(tops[moving]), weight[moving])
         return scale, offset
 
 

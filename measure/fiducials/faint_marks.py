@@ -19,7 +19,7 @@ from measure.detection.localisation import MarkPrediction
 from measure.flags import NO_REASON, Cause, Code, Reason
 from measure.marks.rendering import detail_px, extent_px, picture
 from measure.matching.window import FAINT, Coding
-from measure.results import Covariance, MarkFit
+from measure.results import Covariance, MarkFit, largest_sigma_px
 from measure.scans.scan import Scan, means
 
 _SHOWS = 1 / 3  # fraction of the usual contrast: a background that leaves less to a mark hides it
@@ -56,7 +56,7 @@ class FaintMark:
         """Standard deviation of the place in its least accurate direction, without the rotation uncertainty."""
         parts = self.fit.place_covariance.parts
         place_px2 = sum((part for cause, part in parts.items() if cause != Cause.OWN_TURN), np.zeros((2, 2)))
-        return float(np.sqrt(np.linalg.eigvalsh(place_px2)[-1]))
+        return largest_sigma_px(place_px2)
 
 
 def reason_not_found(

@@ -11,7 +11,8 @@ from measure.flags import NO_REASON, Cause, Code, Reason
 from measure.marks.rendering import extent_px, mark_window
 from measure.marks.shapes import FrameCorner, Mark, MarkShape, MarkTemplate
 from measure.matching.frame_edge import fit_frame_corner
-from measure.matching.match import MatchOptions, match
+from measure.matching.match import match
+from measure.matching.models import MatchOptions
 from measure.matching.window import FAINT, pixels_beyond_edge, read_window
 from measure.noise.grain import BESIDE_PX
 from measure.results import MarkFit

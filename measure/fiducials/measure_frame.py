@@ -65,7 +65,7 @@ from measure.marks.shapes import (
 from measure.matching.models import PIXEL_VARIANCE_PX2, MatchOptions
 from measure.matching.window import ScanWindow, read_window
 from measure.noise.noise_model import may_be_noise
-from measure.results import MarkFit
+from measure.results import MarkFit, largest_sigma_px
 from measure.scans.parallel import map_in_threads
 from measure.scans.scan import Scan
 from measure.tone.curve import LINEAR
@@ -101,7 +101,6 @@ _FAINT_SIGMA_PX = 0.75  # px, largest standard deviation of a measured faint mar
 _SAME_PX = 1.0  # px between two places of one faint mark at most; each is more accurate than that
 _EXTREMES = (0.5, 99.5)  # percentiles of the grey values taken as darkest and lightest
 _SURROUND = 6.0  # times a mark's own extent: enough of the scan for its darkest and lightest grey values
-_TYPICAL = 8  # inliers from which the usual grey values of marks are taken
 RANDOM_PLACES = 64  # compared beside the marks: enough to test three marks found of four
 _OFFSETS = (2.5, 4.5)  # in search radii: beyond the response of the mark itself
 FITTED_PX = 3.0  # px, largest distance between the fitted place and the correlation peak
@@ -156,7 +155,7 @@ class Frame:
     ) -> "Frame":
         """Start a frame from a placement, with no mark detected yet."""
         none = np.zeros(len(layout.marks), dtype=bool)
-        places = placement.places_px(np.array([mark.xy_mm for mark in layout.marks]))
+        places = placement.places_px(layout.places_mm)
         detections = tuple(Detection(place, False, None) for place in places)
         tone = FrameTone(scan.tone.prior)
         start, film = placement.pixel_from_camera, placement.film
@@ -165,7 +164,7 @@ class Frame:
     @cached_property
     def camera_mm(self) -> Array:
         """(n, 2) given coordinates of the marks."""
-        return np.array([mark.xy_mm for mark in self.layout.marks])
+        return self.layout.places_mm
 
     @property
     def pitch_mm(self) -> Array:
@@ -253,10 +252,15 @@ class Frame:
         """Placement by the interior orientation from the inliers."""
         return replace(self.placement, pixel_from_camera=self.pixel_from_camera, film=self.film)
 
+    @cached_property
+    def inside(self) -> Mask:
+        """(n,) mask of the marks predicted within the scan."""
+        return np.array([detection.inside for detection in self.detections])
+
     @property
-    def inside(self) -> int:
-        """Number of marks predicted within the scan."""
-        return sum(detection.inside for detection in self.detections)
+    def inside_count(self) -> int:
+        """Number of these marks."""
+        return int(self.inside.sum())
 
     @property
     def is_certain_of_places(self) -> bool:
@@ -299,7 +303,7 @@ class Frame:
     @property
     def _enough(self) -> int:
         """Least number of inliers."""
-        return max(self.least, int(np.ceil(_AGREEING_SHARE * self.inside)))
+        return max(self.least, int(np.ceil(_AGREEING_SHARE * self.inside_count)))
 
     @property
     def least(self) -> int:
@@ -354,11 +358,6 @@ class Frame:
 def may_be_wrong(covariance_px2: Array) -> bool:
     """Whether a place with this covariance (2, 2) may have a larger error than a measured mark may have."""
     return bool(chdtrc(2, (_WRONG_PX / largest_sigma_px(covariance_px2)) ** 2) > LARGE_ERROR)
-
-
-def largest_sigma_px(covariance_px2: Array) -> float:
-    """Standard deviation in the direction in which it is largest: semi-major axis of the error ellipse (2, 2)."""
-    return float(np.sqrt(np.linalg.eigvalsh(covariance_px2)[-1]))
 
 
 def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
@@ -520,7 +519,7 @@ def random_matches(frame: Frame, indices: Iterable[int]) -> tuple[dict[int, int]
     Returns also the number of these places: around the marks, in eight directions, each for the mark beside it.
     """
     radius_px = frame.first_search_px
-    inside = [index for index, detection in enumerate(frame.detections) if detection.inside]
+    inside = np.flatnonzero(frame.inside).tolist()
     angles = np.arange(8) * np.pi / 4
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     size = np.array([frame.scan.width_px, frame.scan.height_px])
@@ -548,7 +547,7 @@ def detect_faint_marks(frame: Frame, reach_px: float) -> Frame:
     fit farther off may be a pattern beside the mark.
     """
     near = frame.inliers & (frame.misfit_mm <= _NEAR * max(frame.scatter_mm, frame.options.film_sigma_mm))
-    inside = [index for index, detection in enumerate(frame.detections) if detection.inside]
+    inside = np.flatnonzero(frame.inside).tolist()
     marks, fits = [each.mark for each in frame.layout.marks], frame.inlier_fits
     faint = [
         index
@@ -561,29 +560,23 @@ def detect_faint_marks(frame: Frame, reach_px: float) -> Frame:
     # Blur and contrast come from the inliers: a faint mark gives both less accurately.
     blur_px = float(np.median([fit.blur_px for fit in fits.values()]))
     usual_dn = float(np.median([abs(fit.stored_contrast_dn) for fit in fits.values()]))
-    # Darkest and lightest grey values around the marks, which are spread over the scan; and those that light and dark
-    # inliers have, which may exceed them.
+    # Darkest and lightest grey values around the marks, which are spread over the scan.
     starts = [frame.prediction(index, 0.0).pixel_from_mark for index in inside]
     around = [_surrounding_grey(frame, marks[n], start, _SURROUND) for n, start in zip(inside, starts, strict=True)]
     extremes = np.percentile(np.concatenate(around), _EXTREMES, overwrite_input=True)  # spares a copy of much of a scan
-    usual: dict[int, list[float]] = {}
-    for index, fit in list(fits.items())[:_TYPICAL]:
-        grey, sign = _surrounding_grey(frame, marks[index], fit.pixel_from_mark), 1 if fit.contrast_dn > 0 else -1
-        usual.setdefault(sign, []).append(float(np.percentile(grey, _EXTREMES[int(sign > 0)])))
     detections, certain = {}, frame.certain.copy()
     for index in faint:
         expected = frame.prediction(index, reach_px)
         extreme_dn = float(extremes[int(expected.polarity > 0)])
         mark = detect_faint(frame.scan, expected, extreme_dn, blur_px)
-        grey = _surrounding_grey(frame, expected.mark, expected.pixel_from_mark)
-        tones_dn = extreme_dn, float(np.median(usual.get(expected.polarity, [extreme_dn])))
-        room_dn = max(*(expected.polarity * (tone_dn - float(np.median(grey))) for tone_dn in tones_dn), 0.0)
+        grey = _surrounding_grey(frame, expected.mark, expected.pixel_from_mark, 1.0)
+        room_dn = max(expected.polarity * (extreme_dn - float(np.median(grey))), 0.0)
         contrasts_dn = room_dn, usual_dn, float(grey.std())
         detections[index], certain[index] = _choose_detection(frame, index, expected, mark, contrasts_dn)
     return replace(frame.replace_detections(detections), certain=certain)
 
 
-def _surrounding_grey(frame: Frame, mark: Mark, pixel_from_mark: Array, times: float = 1.0) -> Single:
+def _surrounding_grey(frame: Frame, mark: Mark, pixel_from_mark: Array, times: float) -> Single:
     """(n,) grey values in a mark's bounding rectangle, enlarged by a factor."""
     center = pixel_from_mark[:, 2]
     least, greatest = (center + times * (corner - center) for corner in extent_px(mark, pixel_from_mark))

@@ -86,11 +86,8 @@ def measure_fiducials(
     shown = _place_clicked_marks(shown, options.clicks)
     if not contradiction:
         return shown
-    marks = (
-        replace(mark, status=Status.REJECTED, reason=contradiction) if mark.status.is_observation else mark
-        for mark in shown.marks
-    )
-    return replace(shown, marks=tuple(marks), problems=(contradiction.reword(f"{contradiction}."), *shown.problems))
+    marks = tuple(mark.reject(contradiction) for mark in shown.marks)
+    return replace(shown, marks=marks, problems=(contradiction.reword(f"{contradiction}."), *shown.problems))
 
 
 def _search_frame(
@@ -221,10 +218,9 @@ def _lacks_its_own(frame: Frame, rival: Placement) -> bool:
     """Whether the marks that a frame has and a rival placement lacks are hardly found: in a lattice that is named one
     step off, the outermost line."""
     found = np.array([index in frame.inlier_fits for index in range(len(frame.detections))])
-    inside = np.array([detection.inside for detection in frame.detections])
     apart_px, _ = cKDTree(rival.places_px(frame.camera_mm)).query(frame.predicted_px)
-    own = inside & (apart_px > frame.first_search_px)
-    return bool(own.any() and found[own].mean() < _HARDLY * found[inside].mean())
+    own = frame.inside & (apart_px > frame.first_search_px)
+    return bool(own.any() and found[own].mean() < _HARDLY * found[frame.inside].mean())
 
 
 def _is_another_frame(result: SearchResult, other: Placement, frame: Frame) -> bool:

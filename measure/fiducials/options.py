@@ -127,7 +127,7 @@ class FiducialOptions:
 
     def search_mm(self, layout: FiducialLayout) -> float:
         """Largest deviation of a mark of the layout from its given place in the search."""
-        places = np.array([mark.xy_mm for mark in layout.marks])
+        places = layout.places_mm
         span_mm = float(np.hypot(*np.ptp(places, axis=0)))
         tilted_mm = _PERSPECTIVE * span_mm**2 if film_terms(self.film_model, places).shape[1] else 0.0
         return self.misfit_mm + self.affinity * span_mm + tilted_mm

@@ -11,7 +11,7 @@ from measure.fiducials.interior_orientation import AFFINITY_SIGMA
 from measure.fiducials.measurement import frame_corners_px, measure_fiducials
 from measure.fiducials.options import FiducialOptions
 from measure.flags import NO_REASON, RIGHT_PITCH_REFUSED, Code, Reason, Status
-from measure.marks.shapes import FiducialLayout
+from measure.marks.shapes import FiducialLayout, places_mm
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.scans.opening import crop_scan
 from measure.scans.scan import Scan
@@ -45,7 +45,7 @@ def pitch_problem(
     if frame.pixel_from_camera is None or len(marks) < _LEAST_MARKS or is_named:
         return None
     film_um = 1000 / np.hypot(*frame.pixel_from_camera[:, :2].T)  # film per pixel, um, across and down
-    places = np.array([mark.xy_mm for mark in marks])
+    places = places_mm(marks)
     lever_mm = float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=0)).min())  # root sum of squares, one axis
     given = float(np.median([max(mark.sigma_mm) for mark in marks]))
     if not lever_mm > given:

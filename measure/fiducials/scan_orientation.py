@@ -114,8 +114,7 @@ def decide_pose(frame: Frame, lines: Sequence[Line] = (), poses: Sequence[str] =
     poses : orientations that are compared.
     """
     layout, fits = frame.layout, list(frame.inlier_fits.values())
-    inside = np.array([detection.inside for detection in frame.detections])
-    missed = frame.predicted_px[inside & ~frame.inliers]
+    missed = frame.predicted_px[frame.inside & ~frame.inliers]
     every = (_name_sites(frame, pose, fits, missed) for pose in poses)
     hypotheses = [each for each in every if each is not None]
     if not hypotheses:

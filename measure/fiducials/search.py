@@ -103,7 +103,7 @@ def is_searched_by_windows(scan: Scan, layout: FiducialLayout, pitch_mm: tuple[f
 
 def is_lattice(layout: FiducialLayout) -> bool:
     """Whether a step maps most marks to others: a lattice may be found one step off."""
-    return len(lattice_steps_mm(np.array([mark.xy_mm for mark in layout.marks]), reach_mm(layout) / 2)) > 0
+    return len(lattice_steps_mm(layout.places_mm, reach_mm(layout) / 2)) > 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +142,7 @@ class FrameSearch:
     ) -> None:
         self.scan, self.layout, self._effort = scan, layout, effort or SearchEffort()
         self._poses = POSES if options.pose == "auto" else (options.pose,)
-        self._camera_mm = np.array([mark.xy_mm for mark in layout.marks])
+        self._camera_mm = layout.places_mm
         self._signs = {mark_sign(mark.mark, assumed) for mark in layout.marks for assumed in (1, -1)}
         self._cache = self._effort.make_cache(scan)
         self._last: tuple[tuple[Pair, Surroundings], Responses] | None = None

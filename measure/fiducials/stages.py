@@ -51,6 +51,7 @@ from measure.flags import (
     Code,
     Reason,
 )
+from measure.geometry import fit_similarity, reduced_px, scan_px
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
 from measure.tone.curve import Tone
@@ -116,7 +117,9 @@ class Stage:
             return best is not None and best.accepted and len(best.clear_fits) == len(best.inliers) >= CHECKED
         if self.kind == "oblique":
             # Weak marks do not count as missing: a perspective displaces marks, but leaves their quality unchanged.
-            return frame is not None and frame.inside - len(frame.inlier_fits) < max(_GAINED, _LACKED * frame.inside)
+            return frame is not None and frame.inside_count - len(frame.inlier_fits) < max(
+                _GAINED, _LACKED * frame.inside_count
+            )
         is_found = frame is not None and (frame.is_faint or not doubt_frame(found.result, frame))
         return self.kind == "pitch" and is_found
 
@@ -243,7 +246,7 @@ def measure_stage(
         return [] if frame is None else [(0.0 if frame.accepted else np.inf, frame)]
     if kind == "oblique":
         frames = (frame for frame in measured if frame.accepted)
-        frames = (frame for frame in frames if len(frame.unblemished) >= max(least[0], frame.inside - least[1]))
+        frames = (frame for frame in frames if len(frame.unblemished) >= max(least[0], frame.inside_count - least[1]))
         evaluated = [(tried * false_frames(result, frame, frame.unblemished), frame) for frame in frames]
     else:
         evaluated = [each for frame in measured if (each := _evaluate(frame, result, tried))]
@@ -351,11 +354,11 @@ def false_frames(result: SearchResult, frame: Frame, indices: Iterable[int]) -> 
     for stretches in (np.zeros(1), _STRETCHES):
         misfit_px = _misfit_px(frame, found_px, stretches)
         tolerance_px = min(max(misfit_px, NARROW * widest_px), widest_px)
-        expected.append(len(stretches) * _false_alarms(result, placement, found_px, frame.inside, tolerance_px))
-    reduced = _CRITERIA * min(expected)
-    if placement.reduction == 1 or not _SELDOM < reduced < _HOPELESS:
-        return reduced
-    return reduced * _share_at_full_resolution(result, frame, found_px) ** min(_COUNTED, len(found_px))
+        expected.append(len(stretches) * _false_alarms(result, placement, found_px, frame.inside_count, tolerance_px))
+    at_reduced = _CRITERIA * min(expected)
+    if placement.reduction == 1 or not _SELDOM < at_reduced < _HOPELESS:
+        return at_reduced
+    return at_reduced * _share_at_full_resolution(result, frame, found_px) ** min(_COUNTED, len(found_px))
 
 
 def _share_at_full_resolution(result: SearchResult, frame: Frame, found_px: Mapping[int, Array]) -> float:
@@ -365,9 +368,10 @@ def _share_at_full_resolution(result: SearchResult, frame: Frame, found_px: Mapp
     others = list[tuple[int, Array]]()
     for index, own in found_px.items():
         responses, key = search.responses, search.key(frame.placement, index)
-        height = responses.dilated(key, search.tolerance_px).height(responses.reduced_px(own))
+        height = responses.dilated(key, search.tolerance_px).height(reduced_px(own, responses.reduction))
         candidates = responses.candidates(key)
-        as_good = responses.scan_px(candidates[responses.highest_about(key, candidates, 0.0)[1] >= height])
+        as_high = candidates[responses.highest_about(key, candidates, 0.0)[1] >= height]
+        as_good = scan_px(as_high, responses.reduction)
         compared = as_good[: RANDOM_PLACES // len(found_px)]
         others += [(index, place) for place in compared if np.hypot(*(marks_px - place).T).min() > apart_px]
     weakest = min(frame.response(index, place, FITTED_PX) for index, place in found_px.items())
@@ -382,17 +386,16 @@ def _share(hits: int, places: int) -> float:
 
 def _misfit_px(frame: Frame, found_px: Mapping[int, Array], stretches: Array) -> float:
     """Largest residual, px of the reduced scan, of the marks found after a similarity with the best stretch."""
-    if not found_px:
+    if len(found_px) < 2:
         return 0.0
     placement, pitch = frame.placement, frame.pitch_mm
     given = frame.camera_mm[list(found_px)] @ placement.pixel_from_camera[:, :2].T
     found = np.array([*found_px.values()])
     found = found if placement.lens is None else placement.lens.ideal_px(found)
-    given, found = ((each - each.mean(axis=0)) * pitch for each in (given, found))
     longer = np.stack([1 + stretches / 2, 1 - stretches / 2], axis=-1)
-    given, found = (given * longer[:, None]) @ (1, 1j), found @ (1, 1j)
-    turns = (given.conj() @ found) / np.maximum((np.abs(given) ** 2).sum(axis=1), 1e-12)
-    off = np.abs(found - turns[:, None] * given).max(axis=1)
+    places, found_mm = (given * pitch * longer[:, None]) @ (1, 1j), (found * pitch) @ (1, 1j)
+    scales, shifts = fit_similarity(places, found_mm, np.ones(len(found)))
+    off = np.abs(found_mm - scales[:, None] * places - shifts[:, None]).max(axis=1)
     return float(off.min() / pitch.mean() / placement.reduction)
 
 
@@ -409,7 +412,7 @@ def _false_alarms(
     responses, shares, same_px = search.responses, [], 1
     for index, place in found_px.items():
         dilation = responses.dilated(search.key(placement, index), tolerance_px)
-        shares.append(dilation.share(responses.reduced_px(place)))
+        shares.append(dilation.share(reduced_px(place, responses.reduction)))
         same_px = dilation.area_px
     counts = np.arange(max(min(3, inside), 1), len(shares) + 1)
     if len(counts) == 0:
@@ -438,7 +441,7 @@ def doubt_frame(result: SearchResult, frame: Frame) -> Reason:
     """
     if len(frame.inlier_fits) >= _SURE:
         return NO_REASON
-    inside = frame.inside
+    inside = frame.inside_count
     # A mark searched only where the others predict it is no independent evidence.
     clear = [index for index in frame.clear_fits if not frame.detections[index].closer]
     if len(clear) < inside:

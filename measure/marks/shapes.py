@@ -223,6 +223,11 @@ class LayoutMark:
     mark: Mark
 
 
+def places_mm(marks: Sequence[LayoutMark]) -> Array:
+    """(n, 2) coordinates of marks."""
+    return np.array([mark.xy_mm for mark in marks])
+
+
 @dataclass(frozen=True)
 class WrittenPlace:
     """Place of a camera's writing on its film.
@@ -245,6 +250,11 @@ class FiducialLayout:
     marks: tuple[LayoutMark, ...]
     frame_mm: Point
     writing: tuple[WrittenPlace, ...] = ()
+
+    @property
+    def places_mm(self) -> Array:
+        """(n, 2) coordinates of the marks."""
+        return places_mm(self.marks)
 
 
 def cross(arm_mm: float, line_mm: float, gap_mm: float = 0.0, angle_deg: float = 0.0) -> tuple[Part, ...]:
@@ -383,8 +393,7 @@ def limit_to_crossings(layout: FiducialLayout) -> FiducialLayout:
     """Limit crosses whose arms reach halfway to the next mark to a few line widths around their points."""
     if len(layout.marks) < 2:
         return layout
-    xy = np.array([mark.xy_mm for mark in layout.marks])
-    marks = []
+    xy, marks = layout.places_mm, []
     for mark, next_mm in zip(layout.marks, np.asarray(cKDTree(xy).query(xy, k=2)[0])[:, 1], strict=True):
         shape = mark.mark
         if isinstance(shape, MarkShape) and shape.is_cross:

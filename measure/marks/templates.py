@@ -11,6 +11,7 @@ frames: a shift of the fiducial's coordinates.
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -324,7 +325,7 @@ def _align_chips(chips: Sequence[Chip], side: int, pitch_um: float) -> tuple[Sha
     places = [np.array(chip.pixel_from_mark) for chip in chips]
 
     def stack() -> Array:
-        return np.stack([_resampled(*pair, side, pitch_um) for pair in zip(chips, places, strict=True)])
+        return np.stack([resample_chip(*pair, side, pitch_um) for pair in zip(chips, places, strict=True)])
 
     shared, steady = first_picture(stack()), np.ones((side, side), dtype=bool)
     for _ in range(_PHASES if len(chips) > 1 else 0):
@@ -339,14 +340,15 @@ def _align_chips(chips: Sequence[Chip], side: int, pitch_um: float) -> tuple[Sha
     return shared, steady
 
 
-def _resampled(chip: Chip, pixel_from_mark: Array, side: int, pitch_um: float) -> Array:
-    """Resample a chip to the mark's axes, x right and y up, with its origin in the centre pixel."""
+def resample_chip(chip: Chip, pixel_from_mark: Array, side: int, pitch_um: float, order: Literal[1, 3] = 3) -> Array:
+    """Resample a chip to the mark's axes, x right and y up, with its origin in the centre pixel, by splines of an
+    order. side: of the resampled image, odd."""
     step = (np.arange(side) - side // 2) * (pitch_um / 1000)
     mark_mm = np.stack(np.meshgrid(step, -step))
     col, row = np.tensordot(pixel_from_mark[:, :2], mark_mm, axes=1) + (
         pixel_from_mark[:, 2] - np.array(chip.origin_px)
     ).reshape(2, 1, 1)
-    return np.asarray(ndimage.map_coordinates(chip.grey, [row, col], order=3, mode="nearest"))
+    return np.asarray(ndimage.map_coordinates(chip.grey, [row, col], order=order, mode="nearest"))
 
 
 def _steadiness(residuals: Array, image: Array, steady: Mask) -> Array:

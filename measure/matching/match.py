@@ -32,8 +32,6 @@ from measure.noise.grain import blank_patches, grain_model, is_coloured
 from measure.noise.noise_model import NoiseModel, as_if_white, combined, factors, is_textured
 from measure.results import Covariance, MarkFit
 
-__all__ = ["MarkFit", "MatchOptions", "match"]
-
 _WIDER = 1.05  # relative width of lines, step of the difference
 _SPARE_PX = 2.0  # px beyond the margin, so that the mark can move
 

@@ -1,6 +1,5 @@
 """Detection in blocks: each thread searches one part of the scan, at full resolution and reduced."""
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from measure.array_types import Array, Single
+from measure.geometry import linear_scale, scan_px
 from measure.matching.window import Sides, clipped_sides
 from measure.scans.metadata import Samples
 from measure.scans.parallel import map_in_threads
@@ -108,8 +108,7 @@ class TargetCandidate:
     @property
     def radius_px(self) -> float:
         """Radius of the circle of equal area."""
-        (a, b), (c, d) = self.pixel_from_disk.tolist()
-        return math.sqrt(abs(a * d - b * c))
+        return linear_scale(self.pixel_from_disk)
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,9 +218,9 @@ def _octave_patches(block: ScanBlock, octaves: Sequence[Octave]) -> Iterator[Pat
         part = _part_size(width, _WIDEST_PX, factor) // factor
         for col0 in range(0, width // factor, part):
             first, last = spare + col0, spare + min(col0 + part, width // factor) + 2 * margin
-            place = np.array(block.place_px) + factor * np.array([first, spare]) + (factor - 1) / 2
             found = octave.find(small[rows, first:last])
-            found = Patches(found.centers * factor + place, found.shapes * factor, found.contrasts)
+            centers = block.place_px + scan_px(np.add(found.centers, (first, spare)), factor)
+            found = Patches(centers, found.shapes * factor, found.contrasts)
             edge = np.array([block.scan.width_px, block.scan.height_px]) - 0.5
             yield found.part(np.all(found.centers < edge, axis=1))
 

@@ -11,13 +11,13 @@ from measure.flags import DISK_UNLIKE_THE_OTHERS, LARGE_ERROR, NO_REASON, Cause,
 from measure.geometry import linear_scale
 from measure.marks.rendering import mark_window
 from measure.marks.shapes import Disk, MarkShape
-from measure.matching.match import MatchOptions, match
-from measure.matching.models import GREY
+from measure.matching.match import match
+from measure.matching.models import GREY, MatchOptions
 from measure.matching.window import read_window
 from measure.noise.grain import BESIDE_PX
 from measure.noise.noise_model import may_be_noise
 from measure.noise.robust_estimation import MEDIAN_EFFICIENCY, SIGMA_OF_DEVIATION
-from measure.results import MarkFit
+from measure.results import MarkFit, largest_sigma_px
 from measure.scans.jpeg import covariance_of_compression
 from measure.scans.scan import Scan
 from measure.targets.block_search import Patches, ScanBlock, TargetCandidate
@@ -287,7 +287,7 @@ def _dust_reason(disk: FittedDisk, off: Array, squares: float, count: int) -> Re
             "it",
             Code.DUST,
         )
-    sigma = float(np.sqrt(np.linalg.eigvalsh(disk.covariance_px2)[-1]))
+    sigma = largest_sigma_px(disk.covariance_px2)
     if chdtrc(2, (_LARGE_PX / sigma) ** 2) > LARGE_ERROR:
         message = (
             f"its standard deviation is {sigma:.2f} px, the largest part from {disk.place_covariance.largest.shown}"

@@ -11,6 +11,7 @@ from scipy.optimize import linear_sum_assignment
 from measure.array_types import Array, Integers
 from measure.detection.correlation import local_maxima
 from measure.flags import NO_REASON, Code, Reason, Status
+from measure.geometry import scan_px
 from measure.marks.rendering import extent_px, picture
 from measure.marks.shapes import MarkShape, Polarity, cross
 from measure.noise.robust_estimation import robust_scale
@@ -251,7 +252,7 @@ def _correlation_peaks(scan: Scan, prediction: TargetPrediction, polarity: str, 
     score = np.asarray(np.nan_to_num(score, posinf=0.0, neginf=0.0), np.float32)
     signed = np.asarray({"light": score, "dark": -score}.get(polarity, np.abs(score)), np.float32)
     peaks, _ = local_maxima(signed, signed.size, _LEAST_CORRELATION, 1)
-    places = (peaks + half) * factor + (factor - 1) / 2 + corner
+    places = scan_px(peaks + half, factor) + corner
     within = np.hypot(*(places - prediction.center_px).T) <= prediction.search_px + factor
     return list(places[within][:_MOST_SPOTS])
 

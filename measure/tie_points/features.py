@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from measure.array_types import Array, Indices, Mask
 from measure.errors import MeasurementError
 from measure.flags import Code, Reason
-from measure.geometry import linear_scale
+from measure.geometry import linear_scale, scan_px
 from measure.scans.opening import open_scan
 from measure.scans.parallel import map_or_replace
 from measure.scans.scan import Scan
@@ -142,7 +142,7 @@ def _features(count: int, are_alike: bool, what_fails: str, frame: TieFrame) -> 
     places = found.places_px
     if mirrored:
         places = np.array([picture.shape[1] - 1, 0]) + places * np.array([-1, 1])
-    found = replace(found, places_px=places * factor + (factor - 1) / 2, size_px=size_px, reduction=factor)
+    found = replace(found, places_px=scan_px(places, factor), size_px=size_px, reduction=factor)
     found = found.part(np.flatnonzero(frame.usable(found.places_px, size_px)))
     cell = np.floor(found.places_px / size_px * _CELLS).astype(np.intp) @ np.array([1, _CELLS])
     return found.part(interleave_groups(cell, found.strengths)[:count])

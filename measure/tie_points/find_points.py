@@ -19,7 +19,7 @@ from measure.array_types import Array, Mask
 from measure.errors import MeasurementError
 from measure.flags import NO_REASON, POINT_REFUSED, Code, Reason, Status
 from measure.noise.robust_estimation import robust_scale
-from measure.results import Covariance, MarkMeasurement
+from measure.results import Covariance, MarkMeasurement, largest_sigma_px
 from measure.scans.parallel import map_or_replace
 from measure.tie_points.features import Features, TieFrame, find_all_features, read_pieces, unreachable
 from measure.tie_points.multi_image import RADIUS_PX, Bending, Matched, Piece, bending_variance, match_pieces
@@ -358,7 +358,7 @@ def _mark(name: str, point: TiePoint, frame: int, options: TieOptions) -> MarkMe
     if frame in point.unmatched:
         return MarkMeasurement(name, "tie", place, None, Status.REJECTED, point.unmatched[frame])
     piece = point.matched[frame]
-    sigma = float(np.sqrt(np.linalg.eigvalsh(point.separation(frame))[-1]))
+    sigma = largest_sigma_px(point.separation(frame))
     quality = {
         "correlation": piece.correlation,
         "gain": piece.gain,

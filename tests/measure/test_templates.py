@@ -19,7 +19,8 @@ from measure.geometry import POSES, UP_FROM_CAMERA
 from measure.marks.shapes import Bar, MarkShape, MarkTemplate, cross, polygon
 from measure.marks.templates import Chip, learn_template, share_origins
 from measure.matching.covariance import honest_covariance
-from measure.matching.match import MatchOptions, match
+from measure.matching.match import match
+from measure.matching.models import MatchOptions
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
 
 Array = NDArray[np.float64]
