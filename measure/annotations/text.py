@@ -183,16 +183,12 @@ def _decoded(probabilities: NDArray[np.float32], characters: Sequence[str]) -> R
     letters = np.array([letter != " " for letter in text], dtype=bool)
     confidences = probabilities.max(axis=1)[starts][letters].astype(float)
     legible = float(((confidences - _CERTAIN) / (1.0 - _CERTAIN)).clip(0.0).sum())
-    return Reading(_spaced(text, starts), float(confidences.mean()) if len(confidences) else 0.0, legible)
-
-
-def _spaced(text: str, columns: NDArray[np.int_]) -> str:
-    """Insert blanks where letters are clearly farther apart, since the network reports few blanks."""
-    steps = np.diff(columns, prepend=columns[:1])
+    # Blanks are inserted where letters are clearly farther apart: the network reports few.
+    steps = np.diff(starts, prepend=starts[:1])
     usual = float(np.median(steps[1:])) if len(steps) > 1 else 0.0
     wide = steps >= max(_BLANK * usual, usual + _BLANK_COLUMNS)
     spaced = "".join(f" {letter}" if gap else letter for letter, gap in zip(text, wide, strict=True))
-    return " ".join(spaced.split())
+    return Reading(" ".join(spaced.split()), float(confidences.mean()) if len(confidences) else 0.0, legible)
 
 
 def read_writing(

@@ -43,10 +43,8 @@ def resample_square(scan: Scan, pixel_from_camera: Array, xy_mm: Array, size_mm:
     place = np.column_stack([linear, linear @ xy_mm + pixel_from_camera[:, 2]])
     chip = cut(scan, place, 2 * half * pitch_mm)
     fine = cv2.GaussianBlur(chip.grey, (0, 0), max(0.5 * pitch_mm * linear_scale(linear), 0.3))
-    resampled = resample_chip(
-        replace(chip, grey=np.asarray(fine, float)), place, 2 * half + 1, 1000 * pitch_mm, order=1
-    )
-    sampled = resampled.astype(np.float32)
+    chip = replace(chip, grey=np.asarray(fine, float))
+    sampled = resample_chip(chip, place, 2 * half + 1, 1000 * pitch_mm, order=1).astype(np.float32)
     return WIDE.flattened(sampled, _DETAIL, scan.full_scale_dn * FAINT)
 
 

@@ -13,8 +13,8 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from numpy.lib.stride_tricks import as_strided
 from numpy.typing import ArrayLike
+from scipy import ndimage
 
 import compiled
 from measure.array_types import Array, Indices, Mask, Single
@@ -35,7 +35,6 @@ from measure.marks.shapes import (
 _DRAWINGS = 16  # cached drawings, more than a camera has kinds of marks
 ROUGH_CELLS = 2  # cells along a pixel's side, for images exact to 0.01
 _BLURRED = 2.0  # in blurs, reach of an edge
-_BLOCK = 4  # pixels averaged by one matrix product; a matrix for more would be mostly zeros
 CELLS = 4  # cells along a pixel's side, finer than the blur of any scan resolves
 _ROUND = 0.002  # cells, largest deviation of an outline from its circle
 
@@ -207,29 +206,20 @@ def _blurred_derivatives(
     else:
         drawing = _drawing(mark, place, blur_px, cells)
     cells, most = drawing.cells, np.max(orders, axis=0)
-    along = [_Average(blur_px, cells, shift, int(order)) for shift, order in zip(drawing.shift_px, most, strict=True)]
+    along = [
+        _PixelMeans(blur_px, cells, shift, int(order)) for shift, order in zip(drawing.shift_px, most, strict=True)
+    ]
     if compiled.kernels is not None:
         pixels, sharp = np.zeros((len(orders), *size[::-1]), np.float32), np.ascontiguousarray(drawing.sharp)
         taps = np.stack([each.taps for each in along])
         col, row = (np.array([each.first for each in along]) - cells * drawing.first).tolist()
         compiled.kernels.blurred_images(sharp, sharp.shape[1], taps, len(taps[0]), (col, row), cells, pixels, size[0])
         return list(pixels)
-    # Compute only the part of the window that the blurred mark reaches; the rest is zero.
-    spare = int(np.ceil(along[0].reach / cells)) + 1
-    low = np.maximum(drawing.first - spare, 0)
-    high = np.minimum(drawing.first + np.array(drawing.sharp.shape[::-1]) // cells + spare, size)
-    images = [np.zeros(size[::-1], np.float32) for _ in orders]
-    if np.any(high <= low):
-        return images
-    (col0, row0), (cols, rows) = low - drawing.first, high - low
-    by_row = along[1].apply(drawing.sharp, int(row0), int(rows))
-    by_both = along[0].apply(
-        np.ascontiguousarray(by_row.transpose(2, 0, 1)).reshape(len(by_row[0, 0]), -1), int(col0), int(cols)
+    by_col, by_row = (
+        axis.matrix(pixels, -cells * first, cell_count)
+        for axis, pixels, first, cell_count in zip(along, size, drawing.first, drawing.sharp.shape[::-1], strict=True)
     )
-    by_both = by_both.reshape(len(by_both), int(cols), len(by_row), int(rows))
-    for image, (order_col, order_row) in zip(images, orders, strict=True):
-        image[low[1] : high[1], low[0] : high[0]] = by_both[order_col, :, order_row].T
-    return images
+    return [by_row[order_row] @ drawing.sharp @ by_col[order_col].T for order_col, order_row in orders]
 
 
 def _drawing(mark: MarkShape, pixel_from_mark: Array, blur_px: float, cells: int) -> _Drawing:
@@ -265,7 +255,7 @@ def _chip_drawing(mark: MarkTemplate, pixel_from_mark: Array, size: tuple[int, i
     return _Drawing(sharp.astype(np.float32), cells, np.array([-pad, -pad]), np.zeros(2))
 
 
-class _Average:
+class _PixelMeans:
     """Operator along one axis: means of blurred cells over each pixel, and derivatives in px up to an order."""
 
     def __init__(self, blur_px: float, cells: int, shift_px: float, order: int) -> None:
@@ -278,30 +268,17 @@ class _Average:
         summed[:, -cells:] = summed[:, -cells - 1, None]
         self.cells = cells
         self.taps = ((summed[:, cells:] - summed[:, :-cells]) / cells)[:, :-1].astype(np.float32)
-        self.reach = reach + abs(whole)
         self.first = -reach - whole
 
-    def apply(self, sharp: Single, first: int, count: int) -> Single:
-        """(orders, count, columns) means and derivatives of count pixels from the first one on. sharp: cells (rows,
-        columns).
-
-        Pixels are processed in blocks, since a matrix for all of them would be mostly zeros.
-        """
+    def matrix(self, count: int, begin: int, cell_count: int) -> Single:
+        """(orders, count, cell_count) means and derivatives of count pixels by the cells of a drawing, the first pixel
+        beginning at cell begin."""
         orders, taps = self.taps.shape
-        blocks = -(-count // _BLOCK)
-        span = (_BLOCK - 1) * self.cells + taps
-        band = np.zeros((orders, _BLOCK * (span + self.cells)), np.float32)
-        # The taps of each pixel are offset by self.cells from those of the previous one.
-        as_strided(band, (orders, _BLOCK, taps), (band.strides[0], 4 * (span + self.cells), 4))[:] = self.taps[:, None]
-        matrix = band[:, : _BLOCK * span].reshape(-1, span)
-        begin, length = first * self.cells + self.first, (blocks - 1) * _BLOCK * self.cells + span
-        rows = np.zeros((length, sharp.shape[1]), np.float32)
-        inside = slice(max(begin, 0), max(min(begin + length, len(sharp)), 0))
-        rows[inside.start - begin : inside.stop - begin] = sharp[inside]
-        step = rows.strides[0]
-        parts = as_strided(rows, (blocks, span, rows.shape[1]), (_BLOCK * self.cells * step, step, rows.strides[1]))
-        means = (matrix @ parts).reshape(blocks, orders, _BLOCK, -1)
-        return np.asarray(means.swapaxes(0, 1).reshape(orders, blocks * _BLOCK, -1)[:, :count])
+        wide = np.zeros((orders, count, cell_count + 2 * taps), np.float32)  # taps beyond the drawing are cut off
+        starts = np.clip(begin + self.first + taps + self.cells * np.arange(count), 0, cell_count + taps)
+        for pixel, start in enumerate(starts.tolist()):
+            wide[:, pixel, start : start + taps] = self.taps
+        return wide[..., taps:-taps]
 
 
 def _kernels(sigma: float, shift: float) -> Array:
@@ -329,8 +306,6 @@ def _kernels(sigma: float, shift: float) -> Array:
 
 def _sampled(image: Array, positions: Array, order: Literal[0, 1, 3]) -> Array:
     """Interpolate a chip's image at columns and rows (2, height, width) by splines of an order."""
-    from scipy import ndimage
-
     return np.asarray(ndimage.map_coordinates(image, positions[::-1], order=order, mode="nearest"))
 
 

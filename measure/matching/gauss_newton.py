@@ -82,7 +82,7 @@ def gauss_newton(model: FitModel, tolerance_px: float, iterations: int, halvings
     Outcome
     """
     outcome = Outcome(UNSETTLED, np.inf)
-    reversible = model if halvings and isinstance(model, ReversibleModel) else None  # a slow test
+    reversible = model if halvings and isinstance(model, ReversibleModel) else None
     for _ in range(iterations):
         step = model.solve()
         if step is None:
@@ -223,18 +223,15 @@ class PictureFit:
         noise_dn = max(robust_scale(model.residuals[self.telling]), _DRAWN * self.contrast_dn, 1e-9)
         clipping_dn = model.noise_dn if model.is_clipped else 0.0  # noise assumed for clipped grey values
         self.variance_dn2 = max(noise_dn**2, clipping_dn**2)
-        self.scale_dn = max(noise_dn, self._misfit_dn(), _SCALE_FLOOR * self.contrast_dn) if robust else np.inf
+        self.scale_dn = np.inf
+        if robust:
+            # Lines thinner than a pixel, or sharpened, deviate from their drawing by far more than the background's
+            # noise: by that scale most of the mark would be taken for damage.
+            shown = np.abs(model.design[-GREY])
+            own = self.telling & (shown > _OWN * shown[self.area].max(initial=0.0))
+            misfit_dn = robust_scale(model.residuals[own]) if own.sum() >= _LEAST_AREA_PX else 0.0
+            self.scale_dn = max(noise_dn, misfit_dn, _SCALE_FLOOR * self.contrast_dn)
         self.reason = gauss_newton(self, tolerance_px, _ITERATIONS, _HALVINGS).reason
-
-    def _misfit_dn(self) -> float:
-        """Robust scale of the residuals where the mark shows; 0 for few pixels.
-
-        Lines thinner than a pixel, or sharpened, deviate from their drawing by far more than the background's noise:
-        by that scale most of the mark would be taken for damage.
-        """
-        shown = np.abs(self.model.design[-GREY])
-        own = self.telling & (shown > _OWN * shown[self.area].max(initial=0.0))
-        return robust_scale(self.model.residuals[own]) if own.sum() >= _LEAST_AREA_PX else 0.0
 
     def solve(self) -> Array | None:
         """Solve the normal equations with Tukey's or the grain's weights. A blur at its limit is held fixed there."""

@@ -121,7 +121,12 @@ def taken_out(used: Mask, design: Array, farthest_px: float = _FARTHEST_PX) -> A
     border, used_design = int(farthest_px), design[:, used]
     within = np.pad(used, border)
     base = np.zeros((len(design), *within.shape), np.float32)
-    orthonormal = _orthonormal_factors(used_design @ used_design.T)
+    # An orthonormal basis of the span of the derivatives.
+    normal = used_design @ used_design.T
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    values, vectors = np.linalg.eigh(normal / np.outer(size, size))
+    significant = values > _ALIKE * values[-1]
+    orthonormal = (vectors[:, significant] / np.sqrt(values[significant])).T / size
     base[: len(orthonormal), within] = orthonormal @ used_design
     shape = padded(within.shape, _REACH_PX)
     spectra = np.conj(fft.rfft2(base, s=shape))
@@ -133,15 +138,6 @@ def taken_out(used: Mask, design: Array, farthest_px: float = _FARTHEST_PX) -> A
         lags = fft.irfft2((spectra * fft.rfft2(sums.reshape(base.shape), s=shape)).sum(axis=0), s=shape)
         taken.append(_KERNELS.reshape(len(_KERNELS), -1) @ lags[np.ix_(_INDEX, _INDEX)].ravel())
     return np.stack(taken, axis=1)
-
-
-def _orthonormal_factors(normal: Array) -> Array:
-    """(k, n) factors that combine images to an orthonormal basis of their k-dimensional span; normal (n, n): their
-    inner products."""
-    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    values, vectors = np.linalg.eigh(normal / np.outer(size, size))
-    significant = values > _ALIKE * values[-1]
-    return np.asarray((vectors[:, significant] / np.sqrt(values[significant])).T / size)
 
 
 def _pixel_products(images: Array | Mask, rings: Sequence[Lags]) -> Array:

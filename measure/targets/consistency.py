@@ -261,7 +261,8 @@ def compare_images(images: Sequence[ImagePoints], xyz: Array) -> list[TargetComp
             moments = of_prior[:, None] * (off**2 + np.einsum("nii->ni", covariance))
             spread = np.maximum(np.sqrt(moments[is_shared].mean(axis=0)), _LEAST * extent)
         for i in range(len(images)):
-            others = readings.leave_out(i)
+            parts = readings.normal, readings.right, readings.squares
+            others = _Readings(*(np.delete(part, i, axis=0) for part in parts))
             offs[i], covariances[i] = others.solve(np.delete(weights, i, axis=0), of_prior, spread)
     return comparisons
 
@@ -292,9 +293,6 @@ class _Readings:
             right[i, image.index] = np.einsum("nij,ni->nj", image.by_point, weighted[..., 3])
             squares[i, image.index] = np.einsum("ni,ni->n", offsets, weighted[..., 3])
         return cls(normal, right, squares)
-
-    def leave_out(self, image: int) -> "_Readings":
-        return _Readings(*(np.delete(part, image, axis=0) for part in (self.normal, self.right, self.squares)))
 
     def solve(self, weights: Array, of_prior: Array, spread: Array) -> tuple[Array, Array]:
         """Corrections (m, 3) and their covariance (m, 3, 3), for weights of the images (i, m) and of the prior (m,)."""
