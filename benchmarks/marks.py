@@ -19,7 +19,7 @@ from true_marks import KIND, KINDS, Kind, TrueMark, grain_correlation, grainy, s
 
 from benchmarks.harness import Row, rms, table
 from benchmarks.measured_marks import CONTRAST, GROUND, Cell, Found, best_errors, draw_mark, measure_mark, start_off
-from measure.scans.jpeg import rounding_step_dn
+from measure.scans.jpeg import quantisation_step_dn
 
 Array = NDArray[np.float64]
 Noise = Callable[[int, np.random.Generator], Array]
@@ -173,7 +173,7 @@ def compressed(grey: Array, quality: int, rng: np.random.Generator) -> tuple[Arr
     stored = np.pad(np.clip(np.rint(grey), 0, 255).astype(np.uint8), ((top, 8), (left, 8)), mode="edge")
     data = cv2.imencode(".jpg", stored, (cv2.IMWRITE_JPEG_QUALITY, quality))[1]
     whole = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), float)
-    return whole[top : top + grey.shape[0], left : left + grey.shape[1]], rounding_step_dn(data.tobytes())
+    return whole[top : top + grey.shape[0], left : left + grey.shape[1]], quantisation_step_dn(data.tobytes())
 
 
 def misfit(kind: Kind, _part: float, count: int, seeds: list[int]) -> Row:
@@ -194,7 +194,7 @@ def misfit(kind: Kind, _part: float, count: int, seeds: list[int]) -> Row:
             if found is not None and not found.flagged:
                 errors.append(found.center_px - mark.place[:, 2])
                 claimed.append(found.covariance_px2)
-                without.append(found.covariance_px2 - found.unlike_drawing_px2)
+                without.append(found.covariance_px2 - found.model_misfit_px2)
                 larger.append(np.sqrt(np.trace(claimed[-1]) / np.trace(without[-1])))
         row[name] = f"{np.mean(larger):.3f} {whitened_rms(errors, without):.2f} {whitened_rms(errors, claimed):.2f}"
     return row

@@ -28,7 +28,7 @@ class Found:
     center_px: Array
     covariance_px2: Array
     flagged: str = ""
-    unlike_drawing_px2: Array = field(default_factory=lambda: np.zeros((2, 2)))
+    model_misfit_px2: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
 
 @dataclass
@@ -128,9 +128,9 @@ def measure_mark(
     fit = detect_mark(scan, MarkPrediction(mark.kind.shape, start, SEARCH_PX, polarity), options, frame_sigma).fit
     if fit is None:
         return None
-    unlike_drawing_px2 = fit.place_covariance.parts.get(Cause.UNLIKE_DRAWING, np.zeros((2, 2)))
+    model_misfit_px2 = fit.place_covariance.parts.get(Cause.MODEL_MISFIT, np.zeros((2, 2)))
     flagged = "damaged" if fit.damaged_fraction > CLEAR_DAMAGE else ""
-    return Found(fit.center_px, fit.covariance_px2, flagged, unlike_drawing_px2)
+    return Found(fit.center_px, fit.covariance_px2, flagged, model_misfit_px2)
 
 
 def grey_is_light(mark: TrueMark, grey: Array) -> bool:

@@ -17,7 +17,7 @@ from benchmarks.search_frames import FRAME_MM, GIVEN_SIGMA_MM, PITCH_UM, SearchC
 from measure.fiducials.across_frames import check_frames
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
-from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polarity, polygon, turned
+from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polarity, polygon, rotate_mark
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.tone.curve import Tone
 from synthetic_images.scene import Tones
@@ -97,7 +97,7 @@ def solid_layout(rng: np.random.Generator, outline: Outline, at_mm: float, uneve
     for number in range(4):
         sign = -1.0 if mirrored and number % 2 else 1.0
         drawn = MarkShape(polygon(tuple((x, sign * y) for x, y in outline)), polarity=polarity)
-        shape = turned(drawn, 90.0 * number)
+        shape = rotate_mark(drawn, 90.0 * number)
         place = at_mm * np.array([np.cos(number * np.pi / 2), np.sin(number * np.pi / 2)])
         place = np.round(place + (rng.uniform(-uneven_mm, uneven_mm, 2) if uneven_mm else 0.0), 6)
         marks.append(LayoutMark(str(number + 1), (float(place[0]), float(place[1])), (GIVEN_SIGMA_MM,) * 2, shape))

@@ -27,7 +27,7 @@ from benchmarks.harness import Row, rms
 from benchmarks.measured_marks import CONTRAST, GROUND, draw_mark, measure_mark, start_off
 from measure.boards.corner_fit import junctions
 from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
-from measure.noise.robust_estimation import _opened, robust_scale
+from measure.noise.robust_estimation import _open_mask, robust_scale
 from measure.targets.detection import DiskSearch, disk_candidates
 
 Array = NDArray[np.float64]
@@ -178,7 +178,7 @@ def morphology(count: int) -> str:
     rng = np.random.default_rng(SEED)
     masks = [cv2.GaussianBlur(rng.standard_normal((61, 61)), (0, 0), 1.2) > 0.15 for _ in range(20 * count)]
     start = time.process_time()
-    ours = [_opened(mask) for mask in masks]
+    ours = [_open_mask(mask) for mask in masks]
     middle = time.process_time()
     theirs = [opening(mask, np.ones((2, 2), bool)) for mask in masks]
     end = time.process_time()

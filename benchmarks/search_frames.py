@@ -20,8 +20,8 @@ from measure.marks.shapes import (
     dot,
     polygon,
     ring_cross,
-    turned,
-    turned_part,
+    rotate_mark,
+    rotate_part,
 )
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import NO_TAGS
@@ -145,7 +145,7 @@ def _layout(rng: Generator, kind: str, symmetry: str) -> FiducialLayout:
     for number, ((x, y), (dx, dy), parts) in enumerate(zip(places, offsets.tolist(), drawings, strict=True)):
         shape = MarkShape(parts)
         if kind == "wing":
-            shape = MarkShape(tuple(turned_part(part, float(np.degrees(np.arctan2(y, x)))) for part in parts))
+            shape = MarkShape(tuple(rotate_part(part, float(np.degrees(np.arctan2(y, x)))) for part in parts))
         marks.append(LayoutMark(str(number + 1), (x + dx, y + dy), (GIVEN_SIGMA_MM, GIVEN_SIGMA_MM), shape))
     return FiducialLayout(tuple(marks), (FRAME_MM, FRAME_MM))
 
@@ -244,7 +244,7 @@ def _figure(rng: Generator, layout: FiducialLayout, geometry: FrameGeometry, ton
     kind = str(rng.choice(KINDS))
     drawn = layout.marks[0].mark if rng.random() < 0.4 else MarkShape(_drawing(kind))
     assert isinstance(drawn, MarkShape)
-    shown = turned(drawn, float(rng.uniform(0.0, 360.0)) if rng.random() < 0.3 else 0.0)
+    shown = rotate_mark(drawn, float(rng.uniform(0.0, 360.0)) if rng.random() < 0.3 else 0.0)
     place, size = _free_place(rng, layout), 1.0 if rng.random() < 0.5 else float(rng.uniform(0.5, 2.0))
     mark = scene_mark(shown)
     assert isinstance(mark, DrawnMark)

@@ -128,7 +128,7 @@ class Cause(MeaningfulWord):
     NOISE = "noise", "Film grain and scanner noise, estimated from the image."
     ROUNDING = "rounding", "Quantisation of the grey values."
     SECOND_ORDER = "second order", "Second-order effects of position, blur and contrast for a soft and faint mark."
-    UNLIKE_DRAWING = (
+    MODEL_MISFIT = (
         "unlike drawing",
         "Model misfit: at the edges the image differs from the drawing by more than noise.",
     )
@@ -137,10 +137,10 @@ class Cause(MeaningfulWord):
     TONE = "tone", "Uncertainty of the tone curve between light and grey values."
     SHARPENING = "sharpening", "Uncertainty of the scan's sharpening."
     CHANGED_TONES = "changed tones", "A learned mark may have other half tones than in the scans it was learned from."
-    LANDSCAPE = "landscape", "The background within a notch has texture."
+    NOTCH_BACKGROUND = "landscape", "The background within a notch has texture."
     COMPRESSION = "compression", "Loss of the mark's edges by JPEG compression."
     TOUCHED = "touched", "Something may touch the mark, judging by its size or shape."
-    OWN_TURN = (
+    ROTATION = (
         "own turn",
         "Rotation and scale are those of the frame, with its standard deviations; they were not fitted.",
     )
@@ -160,7 +160,11 @@ class Cause(MeaningfulWord):
     @property
     def shown(self) -> str:
         """Name for readers; files keep the value."""
-        names = {Cause.UNLIKE_DRAWING: "model misfit", Cause.OWN_TURN: "rotation", Cause.LANDSCAPE: "notch background"}
+        names = {
+            Cause.MODEL_MISFIT: "model misfit",
+            Cause.ROTATION: "rotation",
+            Cause.NOTCH_BACKGROUND: "notch background",
+        }
         return names.get(self, self.value)
 
 
@@ -238,7 +242,7 @@ FALSE_DOUBT = _limit(
 RIGHT_PITCH_REFUSED = _limit(0.01, "probability of rejecting a right pitch", "the frame has a problem")
 
 # Tests of a window before a fit.
-NATURAL_END = _limit(  # there are many windows
+CLIPPED_END = _limit(  # there are many windows
     1e-6, "p-value of the accumulation of grey values at an end of the range", "they count as clipped"
 )
 JPEG_GRID = _limit(

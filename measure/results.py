@@ -8,7 +8,6 @@ from html import escape
 from typing import Any, Literal
 
 import numpy as np
-from scipy.special import chdtrc
 
 from measure.annotations.lines import Line
 from measure.array_types import Array
@@ -232,7 +231,7 @@ class FrameMeasurement:
         return f"<p>{escape(repr(self))}</p><table><tr>{head}</tr>{rows}</table>"
 
 
-def moved_frame(frame: FrameMeasurement, shift_px: Array) -> FrameMeasurement:
+def shift_frame(frame: FrameMeasurement, shift_px: Array) -> FrameMeasurement:
     """Shift all places of a frame by (2,) column and row, for another pixel origin."""
     right, down = shift_px.tolist()
     marks, lines, matrix = [], [], frame.pixel_from_camera
@@ -264,11 +263,6 @@ class SecondPlace:
     def sigmas(self) -> float:
         """Mahalanobis length of the difference."""
         return float(np.sqrt(self.offset_px @ np.linalg.solve(self.covariance_px2, self.offset_px)))
-
-    @property
-    def chance(self) -> float:
-        """p-value of the difference under noise alone (chi-square, 2 degrees of freedom)."""
-        return float(chdtrc(2, self.sigmas**2))
 
 
 @dataclass(frozen=True, eq=False)

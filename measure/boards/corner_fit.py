@@ -188,7 +188,7 @@ def fit_corners(
     read: Callable[[int, int, int], ScanWindow],
     starts: Sequence[CornerStart],
     surface: Surface,
-    rounding_step_dn: float,
+    quantisation_step_dn: float,
     first_block_px: tuple[int, int],
 ) -> list[Corner]:
     """Fit all corners of a board at once. read: returns the square window with the given first column, first row and
@@ -198,7 +198,7 @@ def fit_corners(
     half = max(start.half_px for start in starts)
     firsts = [np.round(start.center_px).astype(int) - half for start in starts]
     windows = [read(int(col), int(row), 2 * half + 1) for col, row in firsts]
-    return _CornerFits(windows, starts, surface, rounding_step_dn, first_block_px).run()
+    return _CornerFits(windows, starts, surface, quantisation_step_dn, first_block_px).run()
 
 
 class _CornerFits:
@@ -209,11 +209,11 @@ class _CornerFits:
         windows: Sequence[ScanWindow],
         starts: Sequence[CornerStart],
         surface: Surface,
-        rounding_step_dn: float,
+        quantisation_step_dn: float,
         first_block_px: tuple[int, int],
     ) -> None:
         self.windows, self.surface = windows, surface
-        self.rounding_step_dn, self.first_block_px = rounding_step_dn, np.array(first_block_px)
+        self.quantisation_step_dn, self.first_block_px = quantisation_step_dn, np.array(first_block_px)
         self.origin = np.array([window.origin_px for window in windows], float)
         self.start = np.array([start.center_px for start in starts], float) - self.origin
         self.reach = np.array([start.reach_px for start in starts], float)
@@ -252,12 +252,12 @@ class _CornerFits:
         lists = [np.flatnonzero(each) for each in near.all(axis=1)]
         self.counts = [len(each) for each in lists]
         self.pixels = np.zeros((len(lists), max(self.counts)), np.intp)
-        self.valid, self.grey, self.sides = (np.zeros(self.pixels.shape, np.float32) for _ in range(3))
+        self.valid, self.grey, self.ends = (np.zeros(self.pixels.shape, np.float32) for _ in range(3))
         for number, (chosen, window) in enumerate(zip(lists, self.windows, strict=True)):
             here, usable = (number, slice(len(chosen))), window.usable.ravel()[chosen]
             self.pixels[here], self.valid[here] = chosen, usable
             self.grey[here] = np.where(usable, window.grey.ravel()[chosen], 0.0)
-            self.sides[here] = window.sides.ravel()[chosen]
+            self.ends[here] = window.ends.ravel()[chosen]
         self.places = np.stack([axis[self.pixels] for axis in (col, row)], axis=1)
 
     def run(self) -> list[Corner]:
@@ -303,10 +303,10 @@ class _CornerFits:
         shared_dn2 = self._structure_dn2(self._pictures(area > 0))
         fails = np.array([bool(reason) for reason in self.reasons]) | (used.sum(axis=1) <= self.unknowns)
         losses = np.zeros_like(covariances)
-        if self.rounding_step_dn:
+        if self.quantisation_step_dn:
             fitted = self._pictures(self.grey - residuals)
             losses = covariances_of_rounding(
-                influence, fitted, self.origin - self.first_block_px, self.rounding_step_dn
+                influence, fitted, self.origin - self.first_block_px, self.quantisation_step_dn
             )
         covariances[fails], noise_dn = np.inf, np.where(fails, np.nan, np.sqrt(variances))
         rounding_dn = np.finfo(np.float32).eps * np.abs(self.linear[:, 1])  # for a uniform window without noise
@@ -398,8 +398,8 @@ class _CornerFits:
         design[:, 4] = (by_u * u + by_v * v) * (-0.5 / sigma**2).astype(np.float32)
         residuals = self.grey[numbers] - (linear[:, None] @ grey)[:, 0]
         # A clipped grey value says nothing where the model lies beyond the end of the range as well.
-        telling = self.sides[numbers] * residuals >= 0
-        self.design[numbers], self.residuals[numbers] = design * telling[:, None], residuals * telling
+        informative = self.ends[numbers] * residuals >= 0
+        self.design[numbers], self.residuals[numbers] = design * informative[:, None], residuals * informative
 
     def _step(self, numbers: Indices, scale: Array) -> Array:
         """Apply a Gauss-Newton step, shortened to the range of the linearisation. Returns (m,) lengths in px."""

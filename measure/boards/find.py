@@ -285,7 +285,7 @@ def _refusal(spec: ChessboardSpec, pattern: WholePattern | None) -> str:
     if columns > spec.columns or rows > spec.rows or pattern.is_bounded:
         return f"{message}. Set columns and rows to the count of the board's inner corners"
     return (
-        f"{message}, and the rest may lie outside of the scan or be covered; nothing tells which part it is. Show the "
+        f"{message}, and the rest may lie outside of the scan or be covered; nothing shows which part it is. Show the "
         "board's light border on two adjacent sides, and more of its longer side than the shorter one has"
     )
 

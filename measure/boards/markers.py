@@ -114,7 +114,7 @@ def placed_markers(read: MarkerReadings, board: Markers) -> ReadMarkers:
             corners[number] = places[best]
         elif len(places) > 1:
             refused[number] = Reason(
-                f"marker {number} was read at {len(places)} places, and nothing tells which is the board's: "
+                f"marker {number} was read at {len(places)} places, and nothing shows which is the board's: "
                 "there may be another such board",
                 Code.AMBIGUOUS,
             )

@@ -24,7 +24,7 @@ from measure.boards.specs import (
 )
 from measure.flags import NO_REASON, Cause, Code, Reason, Status
 from measure.matching.models import PIXEL_VARIANCE_PX2
-from measure.matching.window import ScanWindow, clipped_sides
+from measure.matching.window import ScanWindow, clipped_ends
 from measure.noise.robust_estimation import robust_scale
 from measure.results import Covariance, MarkMeasurement
 from measure.scans.scan import Scan
@@ -183,7 +183,7 @@ def _unless_alone(scan: Scan, measured: BoardMeasurement, kind: str, others_px: 
     middle = np.mean([mark.center_px for mark in measured.marks if mark.center_px is not None], axis=0)
     in_file = (np.add(place, scan.origin_px) for place in (middle, *others_px))
     places = " and ".join(f"({column:.0f}, {row:.0f})" for column, row in in_file)
-    message = f"the scan shows {1 + len(others_px)} {kind}, about the pixels {places}, and nothing tells which is meant"
+    message = f"the scan shows {1 + len(others_px)} {kind}, about the pixels {places}, and nothing shows which is meant"
     why = Reason(f"{message}: cover the others", Code.AMBIGUOUS)
     return replace(measured, marks=tuple(mark.reject(why) for mark in measured.marks), ambiguous=why)
 
@@ -205,11 +205,11 @@ def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) ->
     def read(col: int, row: int, side: int) -> ScanWindow:
         place_px = col, row, side, side
         # The place of a crossing does not depend on clipping.
-        sides = clipped_sides(scan.samples(*place_px), scan.full_scale_dn) if stands_alone else None
+        sides = clipped_ends(scan.samples(*place_px), scan.full_scale_dn) if stands_alone else None
         return ScanWindow(scan.window(*place_px), (col, row), scan.inside(*place_px, is_read=True), sides)
 
     surface: Surface = quarter if stands_alone else crossing
-    corners = fit_corners(read, starts, surface, scan.rounding_step_dn, scan.first_block_px)
+    corners = fit_corners(read, starts, surface, scan.quantisation_step_dn, scan.first_block_px)
     fitted = dict(zip(found, corners, strict=True))
     if not stands_alone:
         return fitted
@@ -321,7 +321,7 @@ def _corner_mark(name: str, corner: Corner | None, missing: Reason) -> MarkMeasu
         reason = Reason(f"{100 * corner.damaged_fraction:.0f} % of the pixels about it do not fit", Code.COVERED)
     elif corner.misfit > _WEAK_MISFIT:
         share = f"{100 * corner.misfit:.0f} % of its contrast"
-        reason = Reason(f"a shadow, dirt or other edges about it: they leave {share} unexplained", Code.COVERED)
+        reason = Reason(f"a shadow, dirt or other edges around it: the residuals are {share}", Code.COVERED)
     status = Status.WEAK if reason else Status.MEASURED
     return MarkMeasurement(name, "target", corner.center_px, corner.covariance, status, reason, quality)
 

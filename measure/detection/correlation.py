@@ -21,7 +21,7 @@ _MEDIAN = 5  # size of the median filter, in these squares
 _DRAWN = 0.05  # fraction of the mark's contrast: pixels of the template that differ more from the rim are the mark
 _SMOOTHED_PX = 3.0  # px, standard deviation of a Gaussian that a reduced image still resolves
 _EVEN = 1e-5  # mean square in units of the local contrast below which a window is uniform; rounding is 1/300 of it
-_TOLD_PX = 1 << 20  # largest number of pixels used to estimate the noise's correlation
+_MOST_SAMPLED_PX = 1 << 20  # largest number of pixels used to estimate the noise's correlation
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))  # offsets in rows and columns, each with its opposite
 
 
@@ -51,7 +51,7 @@ class Surroundings:
     def flattened(self, image: Map, detail_px: float, faint_dn: float) -> Map:
         """Subtract structure much coarser than detail_px and normalise by the local contrast.
 
-        A thin cross then gives the same response on a landscape as on a uniform background. Contrasts of faint_dn or
+        A thin cross then gives the same response on image texture as on a uniform background. Contrasts of faint_dn or
         below are damped. The background is a median, which preserves the frame's edge; a mean would spread the edge
         over adjacent marks and hide faint ones.
         """
@@ -123,7 +123,7 @@ def _inverse_covariance(image: Map) -> Map:
     """(3, 3) row of the inverse covariance of an image's pixels, up to a factor: each pixel minus its least-squares
     prediction from its neighbours (conditional autoregression: Besag, 1974)."""
     rows, cols = (np.arange(1, side - 1) for side in image.shape)
-    rows = rows[:: max(1, image.size // _TOLD_PX)]
+    rows = rows[:: max(1, image.size // _MOST_SAMPLED_PX)]
     pairs = np.stack(
         [(image[np.ix_(rows + r, cols + c)] + image[np.ix_(rows - r, cols - c)]).ravel() for r, c in _NEIGHBOURS]
     )

@@ -31,7 +31,7 @@ _QUICK_OPTIONS = FiducialOptions(match=MatchOptions(damage_rounds=1))  # likenes
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class CameraResponse:
     """Response of a scan to a camera's constellation of marks.
 
     expected: number of constellations as good expected in a similar scan without a frame of this camera, infinite
@@ -42,16 +42,18 @@ class Answer:
     placements: tuple[Placement, ...]
 
 
-def search_camera(scan: Scan, layout: FiducialLayout, hypotheses: Sequence[PitchHypothesis], tried: int) -> Answer:
+def search_camera(
+    scan: Scan, layout: FiducialLayout, hypotheses: Sequence[PitchHypothesis], tried: int
+) -> CameraResponse:
     """Search a scan for the constellation of a camera, under pitch hypotheses. tried: number of earlier hypotheses."""
     options, tried = FiducialOptions(), tried + len(hypotheses)
     result = FrameSearch(scan, layout, options, _QUICK).search_room(options, hypotheses)
     found = distinct_places(result.placements, _COMPARED)
     expected = [tried * false_placements(result, placement) for placement in found]
-    return Answer(min(expected, default=np.inf), tuple(found))
+    return CameraResponse(min(expected, default=np.inf), tuple(found))
 
 
-def recognise_frame(scan: Scan, layout: FiducialLayout, answered: Answer, times: float) -> Frame | None:
+def recognise_frame(scan: Scan, layout: FiducialLayout, response: CameraResponse, times: float) -> Frame | None:
     """Detect the frame of a camera in the best placements; None if it is accepted in none.
 
     Parameters
@@ -59,7 +61,7 @@ def recognise_frame(scan: Scan, layout: FiducialLayout, answered: Answer, times:
     answered : response of a thumbnail of the scan; at most two places are tried.
     times : pixels of the scan for one pixel of the thumbnail, along a side.
     """
-    for placement in answered.placements[:_PLACES]:
+    for placement in response.placements[:_PLACES]:
         linear, shift = placement.pixel_from_camera[:, :2], placement.pixel_from_camera[:, 2]
         pixel_from_camera = np.column_stack([times * linear, scan_px(shift, times)])
         enlarged = replace(
@@ -68,7 +70,7 @@ def recognise_frame(scan: Scan, layout: FiducialLayout, answered: Answer, times:
             pitch_mm=(placement.pitch_mm[0] / times, placement.pitch_mm[1] / times),
             reduction=int(np.ceil(times * placement.reduction)),
         )
-        if answered.expected > MAX_FALSE_CAMERAS:
+        if response.expected > MAX_FALSE_CAMERAS:
             # Whether its most significant peaks are improbable as noise is found ten times as fast as by a fit.
             frame = Frame.from_placement(scan, layout, enlarged, _QUICK_OPTIONS)
             indices = range(len(layout.marks))

@@ -16,7 +16,7 @@ from measure.results import ScanOrientation
 from measure.scans.scan import Scan
 
 LEAST_CLICKS = 3  # two do not determine whether the frame is mirrored
-_TOLD = ("the marks that were pointed at say so.",)
+_BY_CLICKS = ("the marks that were pointed at say so.",)
 _COLLINEAR = 1e-3  # fraction of their extent: marks closer to a line do not determine it either
 
 
@@ -34,7 +34,7 @@ def clicked_frame(
         return None
     camera = np.array([given_mm[click.point] for click in known])
     clicked = np.array([(click.col_px, click.row_px) for click in known])
-    is_set, tells = options.pose != "auto", not are_collinear(camera)
+    is_set, is_determined = options.pose != "auto", not are_collinear(camera)
     pixel_mm = np.array(pitch_um or (1.0, 1.0)) / 1000.0
     ideal = clicked if options.lens is None else options.lens.ideal_px(clicked)
     pose, up = _clicked_pose(camera, ideal * pixel_mm * (1.0, -1.0), (options.pose,) if is_set else POSES)
@@ -49,9 +49,13 @@ def clicked_frame(
     ]
     frames = [measure_frame(scan, layout, placement, options) for placement in placements]
     frame = max(frames, key=lambda one: (len(one.unblemished), int(one.inliers.sum())))
-    evidence = _TOLD if is_set or tells else ("the marks that were pointed at lie on a line, which has two sides.",)
+    evidence = (
+        _BY_CLICKS
+        if is_set or is_determined
+        else ("the marks that were pointed at lie on a line, which has two sides.",)
+    )
     contradiction = NO_REASON
-    if is_set and tells:
+    if is_set and is_determined:
         shown, _ = _clicked_pose(camera, clicked * np.array(pitch_um or (1.0, 1.0)) / 1000.0 * (1.0, -1.0), POSES)
         sentence = (
             f"the marks that were pointed at show the scan orientation {shown}, and {pose} is set. A viewer that "
@@ -59,7 +63,7 @@ def clicked_frame(
             "picture as it is stored, or set the right orientation"
         )
         contradiction = NO_REASON if shown == pose else Reason(sentence, Code.POSE)
-    return frame, ScanOrientation(pose, is_set or tells, evidence), contradiction
+    return frame, ScanOrientation(pose, is_set or is_determined, evidence), contradiction
 
 
 def are_collinear(places: Array) -> bool:

@@ -119,7 +119,7 @@ class Placement:
         is_first = distance.argmin(axis=0)[nearest] == np.arange(len(places_px))
         return np.where(within & is_first, nearest, -1)
 
-    def posed(self, pose: str, camera_mm: Array) -> "Placement":
+    def reorient(self, pose: str, camera_mm: Array) -> "Placement":
         """Convert to another pose at the same place of the frame.
 
         The marks get other names. A similarity corrects for the differences of the given coordinates camera_mm (n, 2)
@@ -217,7 +217,7 @@ class PlacementSearch:
             for mm in (_SAME * misfit_mm, misfit_mm)
         )
         if same:
-            self.placements[pose] = [placement.posed(pose, self.camera_mm) for placement in self.placements[same[0]]]
+            self.placements[pose] = [placement.reorient(pose, self.camera_mm) for placement in self.placements[same[0]]]
         else:
             self.placements[pose] = self.find_placements(pose, kinds)
         self.kinds[pose] = kinds

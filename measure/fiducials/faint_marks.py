@@ -55,7 +55,7 @@ class FaintMark:
     def sigma_px(self) -> float:
         """Standard deviation of the place in its least accurate direction, without the rotation uncertainty."""
         parts = self.fit.place_covariance.parts
-        place_px2 = sum((part for cause, part in parts.items() if cause != Cause.OWN_TURN), np.zeros((2, 2)))
+        place_px2 = sum((part for cause, part in parts.items() if cause != Cause.ROTATION), np.zeros((2, 2)))
         return largest_sigma_px(place_px2)
 
 
@@ -233,7 +233,7 @@ class _Field:
             converged=True,
             reason=NO_REASON,
             center_px=place,
-            place_covariance=Covariance.from_noise(inverse @ slopes @ inverse).plus(Cause.OWN_TURN, leaning_px2),
+            place_covariance=Covariance.from_noise(inverse @ slopes @ inverse).plus(Cause.ROTATION, leaning_px2),
             pixel_from_mark=np.column_stack([self.linear * self.step, place]),
             contrast_dn=contrast_dn,
             stored_contrast_dn=self.coding.stored_contrast_dn(ground_dn, contrast_dn),

@@ -289,7 +289,7 @@ def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fi
     height, width = window.grey.shape
     drawn = picture(mark, place, width, height, fit.blur_px)
     changes = [picture(tip, place, width, height, fit.blur_px) / (2 * _CHANGE) for tip in _arm_tips(mark)]
-    used = window.usable & (window.sides == 0)
+    used = window.usable & (window.ends == 0)
     design = np.stack([*changes, drawn, *background_planes(height, width)])[:, used]
     grey = window.grey[used]
     inverse: Array = np.asarray(np.linalg.pinv(design @ design.T), float)

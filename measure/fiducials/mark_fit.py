@@ -111,9 +111,9 @@ def detect_mark(
     if reason:
         return Detection(predicted, True, None, reason)
     if fit.tone is not None:
-        alike = tone_variance(scan.rounding_step_dn, fit.stored_contrast_dn)
+        alike = tone_variance(scan.quantisation_step_dn, fit.stored_contrast_dn)
         fit = replace(fit, tone=replace(fit.tone, information=replace(fit.tone.information, common_variance=alike)))
-    loss = covariance_of_compression(scan.rounding_step_dn, fit.stored_contrast_dn)
+    loss = covariance_of_compression(scan.quantisation_step_dn, fit.stored_contrast_dn)
     fit = replace(fit, place_covariance=fit.place_covariance.plus(Cause.COMPRESSION, loss))
     return Detection(predicted, True, fit, false_alarms=false_alarms)
 

@@ -344,7 +344,7 @@ class Frame:
         if fit.damaged_fraction > CLEAR_DAMAGE + min(usual_damage, _MOST_UNLIKE):
             reasons.append(Reason(f"{fit.damaged_fraction:.0%} of it is damaged", Code.COVERED))
         elif fit.lost_fraction > _MOST_LOST:
-            lost = f"{fit.lost_fraction:.0%} of its edges across one direction is damaged"
+            lost = f"{fit.lost_fraction:.0%} of its edges across one direction are damaged"
             reasons.append(Reason(lost, Code.COVERED))
         own_px2 = fit.place_covariance.without(Cause.SMEAR).px2  # a smear has a reason of its own
         sigma_px = largest_sigma_px(own_px2)
@@ -405,7 +405,7 @@ def _detect(
     A fit that texture could give is dropped, unless all marks together decide on the frame. Faint marks of a frame of
     many are detected later, where the others predict them.
     """
-    match, closer = replace(frame.options.match, tells_sharpening=True), frame.placement.surroundings.robust
+    match, closer = replace(frame.options.match, estimate_sharpening=True), frame.placement.surroundings.robust
 
     def detection(index: int) -> Detection:
         """Detection of one mark."""
@@ -620,27 +620,27 @@ def fit_lines_and_sharpening(frame: Frame, fewest: int = 0) -> Frame:
     cross takes that up, and the ends of its arms are taken for damage, as are the halos of a sharpened scan.
     """
     start, indices = frame, sorted(frame.clear_fits, key=lambda index: -frame.clear_fits[index].significance)
-    options, telling = replace(frame.options.match, tells_sharpening=True), indices
+    options, significant = replace(frame.options.match, estimate_sharpening=True), indices
     before, last = frame.scan.tone.sharpening, None
     for _ in range(_SHARED_ROUNDS):
-        drawn = _widen_drawings(frame, telling)
-        fits = {index: frame.detections[index].fit for index in telling}
+        drawn = _widen_drawings(frame, significant)
+        fits = {index: frame.detections[index].fit for index in significant}
         scores = {index: fit.sharpening for index, fit in fits.items() if fit and fit.sharpening}
         found = before
         if start.agrees and len(scores) >= max(fewest, FEWEST_MARKS):
             found = estimate_sharpening(before, list(scores.values()), len(frame.scan.tone.mean)) or Sharpening()
-        if drawn is frame and found.is_as(before):
+        if drawn is frame and found.is_close_to(before):
             break
-        telling = telling[:_TELLING]
-        if before and last:  # of the others the detail is fitted, which tells nothing of it
-            telling = [index for index in telling if index in scores] or telling
-        last, before = (before, found), found.accelerated(before, last)
-        toned = replace(drawn, scan=drawn.scan.replace_tone(drawn.scan.tone.sharpened(before)))
-        frame = _refit(toned, dict.fromkeys(telling, options), orient=False)
+        significant = significant[:_TELLING]
+        if before and last:  # of the others only the detail is fitted, which is independent of it
+            significant = [index for index in significant if index in scores] or significant
+        last, before = (before, found), found.accelerate(before, last)
+        toned = replace(drawn, scan=drawn.scan.replace_tone(drawn.scan.tone.replace_sharpening(before)))
+        frame = _refit(toned, dict.fromkeys(significant, options), orient=False)
     if frame is start:
         return frame
-    toned = replace(frame, scan=frame.scan.replace_tone(frame.scan.tone.sharpened(found)))
-    return _refit(toned, dict.fromkeys({*indices} - {*telling}, options))
+    toned = replace(frame, scan=frame.scan.replace_tone(frame.scan.tone.replace_sharpening(found)))
+    return _refit(toned, dict.fromkeys({*indices} - {*significant}, options))
 
 
 def _widen_drawings(frame: Frame, among: Sequence[int]) -> Frame:
@@ -921,7 +921,7 @@ def rename_frame(frame: Frame, pose: str) -> Frame:
     Marks found are fitted at their places, the others are detected. The frame is kept unchanged if fewer marks agree
     under the new names.
     """
-    placement = frame.fitted_placement.posed(pose, frame.camera_mm)
+    placement = frame.fitted_placement.reorient(pose, frame.camera_mm)
     found = np.array([fit.center_px for fit in frame.inlier_fits.values()])
     names = placement.names(found, frame.camera_mm).tolist() if len(found) else []
     renamed = Frame.from_placement(frame.scan, frame.layout, placement, frame.options)

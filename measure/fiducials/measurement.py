@@ -18,7 +18,7 @@ from measure.fiducials.interior_orientation import AFFINITY_SIGMA
 from measure.fiducials.mark_fit import Detection
 from measure.fiducials.measure_frame import Frame, measure_frame, rename_frame
 from measure.fiducials.options import CLICK_SIGMA_PX, Click, FiducialOptions
-from measure.fiducials.scan_orientation import decide_pose
+from measure.fiducials.scan_orientation import decide_scan_orientation
 from measure.fiducials.search import SearchResult
 from measure.fiducials.stages import doubt_frame, false_placements, find_frame
 from measure.flags import MAX_FALSE_FRAMES, NO_REASON, Cause, Code, Reason, Status
@@ -44,9 +44,9 @@ _OBLIQUE = Reason(
     '"projective" under [adjust].',
     Code.PERSPECTIVE,
 )
-_BESIDE = 0.95  # fraction of the frame's size: a rival shifted by more is another photograph
+_FRAME_SHIFT = 0.95  # fraction of the frame's size: a rival shifted by more is another photograph
 _AMBIGUOUS = 0.9  # fraction of the best score from which another placement is a rival
-_HARDLY = 0.5  # times the fraction of all marks found
+_FEWER_FOUND = 0.5  # times the fraction of all marks found
 _PLAIN_PX = 3.0  # px across the finest line of a mark: both edges and the inside are resolved
 _ASSUMED = Reason(
     "the scan orientation is only assumed, and another of the learned marks would have its origin elsewhere", Code.POSE
@@ -102,11 +102,11 @@ def _search_frame(
         other = _fitting_pose(scan, layout, pitch_um, options)
         return replace(absent, writing=lines, problems=(*other, *absent.problems))
     is_faint, own, against = frame.is_faint, frame.placement.pose, NO_REASON
-    pose = decide_pose(frame, lines or ())
+    pose = decide_scan_orientation(frame, lines or ())
     if options.pose == "auto":
         if options.writing == "pose" and not pose.decided and frame.accepted:
             lines = _read(scan, layout, frame, options.known_lines)
-            pose = decide_pose(frame, lines or ())
+            pose = decide_scan_orientation(frame, lines or ())
         if pose.name != own:
             renamed = rename_frame(frame, pose.name)
             if renamed is frame:  # fewer marks agree under the new names: its own orientation is kept, only assumed
@@ -115,17 +115,17 @@ def _search_frame(
             frame = renamed
     else:
         if pose.name != own and frame.unblemished:
-            against = _against_the_set_pose(own, decide_pose(frame, lines or (), (own, pose.name)))
+            against = _against_the_set_pose(own, decide_scan_orientation(frame, lines or (), (own, pose.name)))
         pose = ScanOrientation(options.pose, True, _SET)
     # A faint frame is not tested again: it was accepted only if significant.
-    chance = NO_REASON if is_faint else doubt_frame(result, frame)
-    problems = [each.reword(f"{each}.") for each in (*_rivals(result, frame), chance, against) if each]
+    doubt = NO_REASON if is_faint else doubt_frame(result, frame)
+    problems = [each.reword(f"{each}.") for each in (*_rivals(result, frame), doubt, against) if each]
     doubts = problems if frame.unblemished else [_UNSURE, *problems]
     if doubts and options.pose == "auto":
         pose = replace(pose, decided=False, evidence=(*pose.evidence, *doubts))
     if frame.options.film_model != options.film_model:
         problems.append(_OBLIQUE)
-    return replace(present_frame(frame, pose, pitch_um, problems, _FAINT if is_faint else chance), writing=lines)
+    return replace(present_frame(frame, pose, pitch_um, problems, _FAINT if is_faint else doubt), writing=lines)
 
 
 def _fitting_pose(
@@ -135,9 +135,10 @@ def _fitting_pose(
     frame = None if options.pose == "auto" else find_frame(scan, layout, pitch_um, replace(options, pose="auto")).frame
     if frame is None or not frame.unblemished:
         return ()
+    fitting = decide_scan_orientation(frame, ()).name
     sentence = (
-        f"the marks fit in the scan orientation {decide_pose(frame, ()).name}, not in {options.pose}: this, or the "
-        "sign or order of the given coordinates, is wrong."
+        f"the marks fit in the scan orientation {fitting}, not in {options.pose}: this, or the sign or order of the "
+        "given coordinates, is wrong."
     )
     return (Reason(sentence, Code.POSE),)
 
@@ -199,7 +200,7 @@ def _rivals(result: SearchResult, frame: Frame) -> list[Reason]:
         linear, shifts = best.pixel_from_camera[:, :2], (each.pixel_from_camera[:, 2] for each in (other, best))
         shift = np.linalg.solve(linear, np.subtract(*shifts))
         shift_mm = f"({shift[0]:.1f}, {shift[1]:.1f}) mm"
-        if (np.abs(shift) > _BESIDE * np.array(frame.layout.frame_mm)).any():
+        if (np.abs(shift) > _FRAME_SHIFT * np.array(frame.layout.frame_mm)).any():
             sentence = (
                 f"the scan shows another frame {shift_mm} from this one, with {other.supported} marks where this one "
                 f"has {best.supported}: give a scan of one frame, or name both in images.csv by the column window"
@@ -220,7 +221,7 @@ def _lacks_its_own(frame: Frame, rival: Placement) -> bool:
     found = np.array([index in frame.inlier_fits for index in range(len(frame.detections))])
     apart_px, _ = cKDTree(rival.places_px(frame.camera_mm)).query(frame.predicted_px)
     own = frame.inside & (apart_px > frame.first_search_px)
-    return bool(own.any() and found[own].mean() < _HARDLY * found[frame.inside].mean())
+    return bool(own.any() and found[own].mean() < _FEWER_FOUND * found[frame.inside].mean())
 
 
 def _is_another_frame(result: SearchResult, other: Placement, frame: Frame) -> bool:
@@ -241,7 +242,7 @@ def _place_clicked_marks(frame: FrameMeasurement, clicks: Sequence[Click]) -> Fr
             click = by_point[mark.point]
             place = np.array([click.col_px, click.row_px])
             covariance = Covariance({Cause.CLICK: CLICK_SIGMA_PX**2 * np.eye(2)})
-            sentence = f"it is where a person pointed, for nothing could be matched there: {mark.reason}"
+            sentence = f"it is where a person pointed, since nothing could be matched there: {mark.reason}"
             reason = Reason(sentence, Code.CLICKED, *mark.reason.codes)
             mark = replace(mark, center_px=place, covariance=covariance, status=Status.WEAK, reason=reason)
         marks.append(mark)
@@ -292,7 +293,7 @@ def present_frame(
     pose: ScanOrientation,
     pitch_um: tuple[float, float] | None,
     problems: Sequence[Reason],
-    chance: Reason,
+    doubt: Reason,
 ) -> FrameMeasurement:
     """Return the result for a frame that was found.
 
@@ -300,22 +301,22 @@ def present_frame(
     ----------
     pitch_um : given pixel pitch in x and y; None: pixels are taken as square.
     problems : sentences on why the frame may lie elsewhere, in addition to the problems that its marks show.
-    chance : why the frame may be a false alarm, or that its marks are faint; empty otherwise.
+    doubt : why the frame may be a false alarm, or that its marks are faint; empty otherwise.
 
     Notes
     -----
     Measured marks become weak if the frame may be a false alarm or is faint. If its names are ambiguous, or it is more
     likely a false alarm than not, no mark is an observation.
     """
-    if Code.NO_FRAME in chance.codes:
+    if Code.NO_FRAME in doubt.codes:
         places = zip(frame.layout.marks, frame.detections, frame.predicted_px, strict=True)
-        marks = tuple(_unmeasured(mark.id, each, place, chance) for mark, each, place in places)
+        marks = tuple(_unmeasured(mark.id, each, place, doubt) for mark, each, place in places)
         return FrameMeasurement(frame.scan.name, marks, pose, problems=tuple(problems), weights=frame.weights)
     for altered in find_alterations(frame.scan):
         detections = (each.amend(parts={altered.cause: altered.px2}) for each in frame.detections)
         frame, problems = replace(frame, detections=tuple(detections)), (*problems, altered.reason)
     unnamed = next((problem for problem in problems if Code.AMBIGUOUS in problem.codes), NO_REASON)
-    marks = tuple(_row(mark, index, frame, pose, chance, unnamed) for index, mark in enumerate(frame.layout.marks))
+    marks = tuple(_row(mark, index, frame, pose, doubt, unnamed) for index, mark in enumerate(frame.layout.marks))
     problems = (*problems, *_orientation_problems(frame, pitch_um))
     tone = replace(frame.tone, tone=frame.tone.tone.without_priors)
     notes = (frame.channel_note,) if frame.channel_note else ()

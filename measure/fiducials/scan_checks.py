@@ -119,17 +119,17 @@ def _words(scan: Scan, outline: Array) -> str:
     return f'"{first[0]} {first[1]} {high[0] - low[0]} {high[1] - low[1]}"'
 
 
-def with_damage(scan: Scan, frame: FrameMeasurement) -> FrameMeasurement:
+def report_damage(scan: Scan, frame: FrameMeasurement) -> FrameMeasurement:
     """Remove the observations on damaged parts of the scan's file, and put the damage first among the problems."""
     if not scan.damage:
         return frame
     sentence = f"{scan.damage[0].upper()}{scan.damage[1:]}. No mark is measured there: copy the file again, or rescan."
     problem = Reason(sentence, Code.DAMAGED_FILE)
     problems = (problem, *(each for each in frame.problems if each != problem))
-    return replace(frame, marks=without_lost(scan, frame.marks), problems=problems)
+    return replace(frame, marks=drop_lost_marks(scan, frame.marks), problems=problems)
 
 
-def without_lost(scan: Scan, marks: Sequence[MarkMeasurement]) -> tuple[MarkMeasurement, ...]:
+def drop_lost_marks(scan: Scan, marks: Sequence[MarkMeasurement]) -> tuple[MarkMeasurement, ...]:
     """Set marks on damaged parts of the scan's file to `predicted`, with this reason."""
     kept = []
     for mark in marks:

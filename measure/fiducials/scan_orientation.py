@@ -38,7 +38,7 @@ from measure.scans.parallel import map_in_threads
 from measure.scans.scan import Scan, means
 
 DECIDED = 7.0  # log-odds: a thousand to one
-TOLD = 1.0  # log-odds: weaker evidence, below e to one, is not reported
+LEAST_REPORTED = 1.0  # log-odds: weaker evidence, below e to one, is not reported
 _NAMED = 4.0  # in gates: largest distance of a mark from its predicted place for which it gets the name
 _UNMIRRORED = 2.3  # prior log-odds of an unmirrored scan: ten to one; of 16 scans of archives none was mirrored
 _QUOTED = 3  # lines of writing that are quoted
@@ -54,13 +54,17 @@ _FLIP = np.diag([1.0, -1.0])  # from right and up to columns and rows
 _ALIGNMENTS = 3  # Gauss-Newton steps; the chip is already placed to within a cell
 _FEWEST = 40  # pixels needed to compare two chips
 _CHANCE_SIGMAS = 3.0  # standard deviations by which noise may enlarge a difference
-SPOILT = 0.01  # probability that writing, dust or an adjacent object imitates or hides a difference between marks
+DISTURBANCE_P = (
+    0.01  # probability that writing, dust or an adjacent object imitates or hides a difference between marks
+)
 _A_CHARACTER = 1.4  # log-odds of an orientation for each legible character more than in another one
 # Log-odds that a line lies where the camera writes rather than by chance, among four sides with two directions. On
 # seven real frames none of 29 lines with a title field lay elsewhere, and other words (counted by frames, since a
 # stamp may have several) on none of the seven; numbers may be written by hand at any side.
 _A_FIELD, _A_WORD, _A_NUMBER = 6.2, 4.8, 3.6
-_FEIGNED = 1 / 3000  # probability of misleading text: of 3000 readings with a lead of 3 characters none was wrong
+_MISLEADING_TEXT_P = (
+    1 / 3000
+)  # probability of misleading text: of 3000 readings with a lead of 3 characters none was wrong
 _LEAST_RATIO = 1.5  # least ratio of legible characters to those of any other orientation
 _DIRECTIONS: Mapping[Side, tuple[int, int]] = {"left": (-1, 0), "right": (1, 0), "top": (0, 1), "bottom": (0, -1)}
 
@@ -77,7 +81,7 @@ class _Hypothesis:
         is known with few degrees of freedom.
     chi_square : chi-square of the coordinates.
     pictures : (sites,) log-likelihoods of the images.
-    by_chance : log-likelihood of all images if their differences do not belong to the marks.
+    null_likelihood : log-likelihood of all images if their differences do not belong to the marks.
     writing : log-likelihood of the writing.
     """
 
@@ -86,12 +90,12 @@ class _Hypothesis:
     coordinates: float = 0.0
     chi_square: float = 0.0
     pictures: Array = field(default_factory=lambda: np.zeros(0))
-    by_chance: float = -np.inf
+    null_likelihood: float = -np.inf
     writing: float = 0.0
 
     @property
     def pictures_total(self) -> float:
-        return float(np.logaddexp(self.pictures.sum(), self.by_chance))
+        return float(np.logaddexp(self.pictures.sum(), self.null_likelihood))
 
     @property
     def likelihood(self) -> float:
@@ -104,7 +108,7 @@ class _Hypothesis:
         return self.likelihood + (0.0 if self.pose.endswith("m") else _UNMIRRORED)
 
 
-def decide_pose(frame: Frame, lines: Sequence[Line] = (), poses: Sequence[str] = POSES) -> ScanOrientation:
+def decide_scan_orientation(frame: Frame, lines: Sequence[Line] = (), poses: Sequence[str] = POSES) -> ScanOrientation:
     """Decide the scan orientation of a measured frame.
 
     Parameters
@@ -130,21 +134,23 @@ def decide_pose(frame: Frame, lines: Sequence[Line] = (), poses: Sequence[str] =
     def site_likelihoods(index: int) -> Array:
         """(hypotheses,) log-likelihoods of the image at a site."""
         names = [(each.names[index], UP_FROM_CAMERA[each.pose]) for each in hypotheses]
-        shown = [PosedMark(None if name < 0 else layout.marks[name].mark, turn) for name, turn in names]
+        shown = [OrientedMark(None if name < 0 else layout.marks[name].mark, turn) for name, turn in names]
         return MarkSite(frame.scan, *places[index], frame.weights, drawings, reach_px).likelihoods(shown)
 
     pictures = np.array(map_in_threads(site_likelihoods, range(len(places)))).reshape(len(places), len(hypotheses))
-    by_chance = -np.inf
+    null_likelihood = -np.inf
     if any(isinstance(mark.mark, MarkTemplate) and mark.mark.steadiness is None for mark in layout.marks):
         # A chip cut from a single scan cannot be separated from background or writing: its images may favour
         # orientations at random.
-        by_chance = float((np.logaddexp.reduce(pictures, axis=1) - np.log(pictures.shape[1])).sum())
+        null_likelihood = float((np.logaddexp.reduce(pictures, axis=1) - np.log(pictures.shape[1])).sum())
     lines = lines if frame.accepted else ()
     written = np.zeros(len(hypotheses))
     if lines:
         written = writing_likelihoods(lines, layout.writing, [each.pose for each in hypotheses])
     likelihoods = zip(hypotheses, pictures.T, written.tolist(), strict=True)
-    hypotheses = [replace(each, pictures=own, by_chance=by_chance, writing=text) for each, own, text in likelihoods]
+    hypotheses = [
+        replace(each, pictures=own, null_likelihood=null_likelihood, writing=text) for each, own, text in likelihoods
+    ]
     return _decision(hypotheses, layout, len(fits), lines)
 
 
@@ -153,7 +159,7 @@ def _name_sites(frame: Frame, pose: str, fits: Sequence[MarkFit], missed: Array)
     assigned twice, or fewer than two of two or more marks found are named."""
     options, pitch = frame.options, frame.pitch_mm
     centers = np.array([*(fit.center_px for fit in fits), *missed])
-    predicted = frame.fitted_placement.posed(pose, frame.camera_mm).places_px(frame.camera_mm)
+    predicted = frame.fitted_placement.reorient(pose, frame.camera_mm).places_px(frame.camera_mm)
     distance = np.hypot(*np.moveaxis((predicted[:, None] - centers[None]) * pitch, -1, 0))
     near = distance.min(axis=0) < _NAMED * options.gate_mm
     names = np.where(near, distance.argmin(axis=0), -1)
@@ -189,18 +195,18 @@ def _decision(
     best = max(alike, key=lambda each: each.total)
     others = [each for each in hypotheses if each not in alike]
     against = _against(best, max(others, key=lambda each: each.total), layout, lines) if others else ()
-    written, main = {each.pose: each.writing for each in hypotheses} if lines else {}, main_pose(lines)
+    written, main = {each.pose: each.writing for each in hypotheses} if lines else {}, main_orientation(lines)
     if len(alike) == 1:
         reasons = against or (f"no other scan orientation explains the {found} marks found.",)
         return ScanOrientation(best.pose, True, reasons, written, main)
     first, lead = alike[0].pose, best.total - alike[0].total
-    near = [each.pose for each in alike if best.total - each.total < TOLD]
+    near = [each.pose for each in alike if best.total - each.total < LEAST_REPORTED]
     # Among equal ones: that in which most of the writing is upright, so that the frames of a roll agree.
     upright = next((pose for pose in near if main and pose_in_camera(main, pose) == "0"), "")
-    assumed = upright or (best.pose if lead > TOLD else first)
+    assumed = upright or (best.pose if lead > LEAST_REPORTED else first)
     names = ", ".join(each.pose for each in alike)
     chosen = f"{assumed} is assumed{', in which most of what is written is upright' if upright else ''}"
-    if lead > TOLD:
+    if lead > LEAST_REPORTED:
         equal = [pose for pose in near if pose != assumed]
         as_likely = f"as likely as {', '.join(equal)} and " if equal else ""
         sentence = (
@@ -220,28 +226,28 @@ def _against(best: _Hypothesis, rival: _Hypothesis, layout: FiducialLayout, line
     """Sentences with the evidence for the best orientation against the most likely rejected one."""
     sentences = []
     by_site, lead = best.pictures - rival.pictures, best.pictures_total - rival.pictures_total
-    if lead > TOLD:
-        telling = [site for site in np.argsort(-by_site, kind="stable").tolist() if by_site[site] > TOLD]
-        kinds = sorted({_difference(best.names[site], rival.names[site], layout) for site in telling})
+    if lead > LEAST_REPORTED:
+        supporting = [site for site in np.argsort(-by_site, kind="stable").tolist() if by_site[site] > LEAST_REPORTED]
+        kinds = sorted({_difference(best.names[site], rival.names[site], layout) for site in supporting})
         sentences.append(
-            f"{' and '.join(kinds)} at {len(telling)} of {len(by_site)} marks are evidence against the next best "
+            f"{' and '.join(kinds)} at {len(supporting)} of {len(by_site)} marks are evidence against the next best "
             f"orientation {rival.pose} with log-odds {lead:.1f}."
         )
     asymmetry = float(np.sqrt(max(rival.chi_square - best.chi_square, 0.0)))
-    if abs(best.coordinates - rival.coordinates) > TOLD:
+    if abs(best.coordinates - rival.coordinates) > LEAST_REPORTED:
         word = "against" if best.coordinates > rival.coordinates else "for"
         sentences.append(
             f"the asymmetry of the marks' given coordinates, {asymmetry:.1f} sigmas, is evidence {word} orientation "
             f"{rival.pose} with log-odds {abs(best.coordinates - rival.coordinates):.1f}."
         )
-    if abs(best.writing - rival.writing) > TOLD:
+    if abs(best.writing - rival.writing) > LEAST_REPORTED:
         lead = best.writing - rival.writing
         by_line = [
             (line_score(line, layout.writing, best.pose) - line_score(line, layout.writing, rival.pose)) * np.sign(lead)
             for line in lines
         ]
-        telling = [index for index in np.argsort(-np.array(by_line), kind="stable").tolist() if by_line[index] > 0]
-        quoted = ", ".join(f'"{lines[index].text}"' for index in telling[:_QUOTED])
+        supporting = [index for index in np.argsort(-np.array(by_line), kind="stable").tolist() if by_line[index] > 0]
+        quoted = ", ".join(f'"{lines[index].text}"' for index in supporting[:_QUOTED])
         word = "against" if lead > 0 else "for"
         sentences.append(
             f"the writing, such as {quoted}, is evidence {word} orientation {rival.pose} with log-odds {abs(lead):.1f}."
@@ -273,7 +279,9 @@ def writing_likelihoods(lines: Sequence[Line], places: Sequence[WrittenPlace], p
 
 def bounded(scores: Array) -> Array:
     """(n,) log-likelihoods, bounded below by the probability of misleading text."""
-    return np.asarray(np.log((1 - _FEIGNED) * np.exp(scores - scores.max(initial=-np.inf)) + _FEIGNED))
+    return np.asarray(
+        np.log((1 - _MISLEADING_TEXT_P) * np.exp(scores - scores.max(initial=-np.inf)) + _MISLEADING_TEXT_P)
+    )
 
 
 def line_score(line: Line, places: Sequence[WrittenPlace], pose: str) -> float:
@@ -299,7 +307,7 @@ def side_in_camera(side: Side, pose: str) -> Side:
     return next(name for name, other in _DIRECTIONS.items() if np.allclose(direction, other))
 
 
-def main_pose(lines: Sequence[Line]) -> str:
+def main_orientation(lines: Sequence[Line]) -> str:
     """Orientation of most of the text in the scan; "" where another has nearly as many legible characters."""
     if not lines:
         return ""
@@ -310,7 +318,7 @@ def main_pose(lines: Sequence[Line]) -> str:
     return best if not others or ways[best] > _LEAST_RATIO * ways[others[0]] else ""
 
 
-class PosedMark(NamedTuple):
+class OrientedMark(NamedTuple):
     """Mark that a scan orientation predicts at a site. turn (2, 2): from its x and y to right and up. mark None: plain
     background."""
 
@@ -401,7 +409,7 @@ class Drawings:
         self.scan_from_grid = scan_from_up @ np.linalg.inv(grid_from_up)
         self._views = {mark: _draw_view(mark, grid_from_up, blur_px / self.reduction) for mark in set(marks)}
 
-    def views(self, shown: Sequence[PosedMark], spare: int) -> list[MarkImage]:
+    def views(self, shown: Sequence[OrientedMark], spare: int) -> list[MarkImage]:
         """Image that each orientation predicts at a place, centred on grids of one size: spare cells larger on every
         side than the largest image."""
         drawn = [_BARE if each.mark is None else self._views[each.mark] for each in shown]
@@ -433,9 +441,9 @@ class MarkSite:
     drawings: Drawings
     reach_px: float
 
-    def likelihoods(self, shown: Sequence[PosedMark]) -> Array:
+    def likelihoods(self, shown: Sequence[OrientedMark]) -> Array:
         """Log-likelihood of the image under each orientation, up to a constant: 0 for the best, at least
-        log(`SPOILT`), the probability that something else disturbs the image."""
+        log(`DISTURBANCE_P`), the probability that something else disturbs the image."""
         chips = any(isinstance(each.mark, MarkTemplate) for each in shown)
         spare = int(np.ceil(self.reach_px / self.drawings.reduction)) if chips else 0
         views, view_of = _distinct(self.drawings.views(shown, spare))
@@ -459,7 +467,7 @@ class MarkSite:
         if best.is_chip:
             excess = np.minimum(excess, [self._most_excess(best, view, scale) for view in views])
         relative = np.exp(-excess / 2 / _PIXELS_PER_DEGREE)
-        return np.asarray(np.log((1 - SPOILT) * relative + SPOILT))[view_of]
+        return np.asarray(np.log((1 - DISTURBANCE_P) * relative + DISTURBANCE_P))[view_of]
 
     def _most_excess(self, best: MarkImage, view: MarkImage, scale_dn: float) -> float:
         """Largest excess misfit of a chip over the best one that their difference explains, noise included."""

@@ -33,7 +33,7 @@ from measure.fiducials.measure_frame import (
     shows_marks,
 )
 from measure.fiducials.options import FiducialOptions
-from measure.fiducials.scan_orientation import decide_pose
+from measure.fiducials.scan_orientation import decide_scan_orientation
 from measure.fiducials.search import (
     FrameSearch,
     Hypotheses,
@@ -64,15 +64,18 @@ Evaluated = tuple[float, Frame]  # expected number of false frames as good
 
 _TRIALS = 4  # placements tried at full resolution after the best one
 _NOTHING = Reason("no two of the camera's marks were found in the scan", Code.NO_FRAME)
-_GAINED = 3  # marks: one more than the two additional parameters of a perspective may fit by chance
-_LACKED = 0.3  # fraction of the marks that an affine transformation misses if a perspective makes it miss any
+_LEAST_GAINED = 3  # marks: one more than the two additional parameters of a perspective may fit by chance
+_MISSED_SHARE = 0.3  # fraction of the marks that an affine transformation misses if a perspective makes it miss any
 _OBLIQUE = 6  # marks needed to prove a perspective: any four fit one, and two more check it
 _SLIGHT = (-0.005, 0.005, -0.01, 0.01)  # relative stretches for faint marks, searched within narrow bounds only
 _STRETCH = 3 * AFFINITY_SIGMA  # relative error of a given pitch, where marks are too faint to correct it
 _CRITERIA = 3  # by which a false frame may be as good: response heights, misfit, and misfit under a stretch
 _STRETCHES = np.linspace(-0.03, 0.03, 13)  # relative, of non-square pixels; a step moves marks within narrow bounds
-_SELDOM, _HOPELESS = 1e-3, 1e6  # expected false frames between which full resolution may change the decision
-_COUNTED = 3  # marks at most to whose false-alarm rates the share at full resolution applies
+_RARE_FRAMES, _FREQUENT_FRAMES = (
+    1e-3,
+    1e6,
+)  # expected false frames between which full resolution may change the decision
+_MOST_COUNTED = 3  # marks at most to whose false-alarm rates the share at full resolution applies
 _APART = 2.0  # in search radii: beyond the response of a mark itself
 _FREE = 2  # marks that a similarity fits wherever they lie
 _SURE = 12  # inliers from which the frame is no false alarm: specks do not agree so often
@@ -118,7 +121,7 @@ class Stage:
         if self.kind == "oblique":
             # Weak marks do not count as missing: a perspective displaces marks, but leaves their quality unchanged.
             return frame is not None and frame.inside_count - len(frame.inlier_fits) < max(
-                _GAINED, _LACKED * frame.inside_count
+                _LEAST_GAINED, _MISSED_SHARE * frame.inside_count
             )
         is_found = frame is not None and (frame.is_faint or not doubt_frame(found.result, frame))
         return self.kind == "pitch" and is_found
@@ -237,7 +240,7 @@ def measure_stage(
         places = [each for each in places if number * false_placements(result, each) <= MAX_FALSE_PLACEMENTS]
     if kind == "pitch" or stage.tone is not None:
         places = [each for each in places if shows_marks(scan, layout, each, options)]
-    least = _OBLIQUE, _GAINED - 1  # marks in all, and missing ones, for a perspective
+    least = _OBLIQUE, _LEAST_GAINED - 1  # marks in all, and missing ones, for a perspective
     if kind == "oblique":
         places = [each for each in places if each.supported >= max(least[0], len(layout.marks) - least[1])]
     measured = (measure_frame(scan, layout, each, options) for each in places)
@@ -281,7 +284,7 @@ def _evaluate(frame: Frame, result: SearchResult, tried: int) -> Evaluated | Non
     """Evaluate a frame, also in its likeliest pose: names of other poses would hide its marks."""
     placement, frames = frame.placement, [frame]
     if frame.options.pose == "auto" and frame.inliers.any():
-        pose = decide_pose(frame).name
+        pose = decide_scan_orientation(frame).name
         frames += [] if pose == placement.pose else [rename_frame(frame, pose)]
     frames = [each for each in frames if each.agrees]
     if not frames:
@@ -303,9 +306,7 @@ def explain_misfit(frame: Frame) -> Reason:
         )
     if frame.failed_fits:
         names = ", ".join(frame.layout.marks[index].id for index in frame.failed_fits)
-        return Reason(
-            f"only {found}, and the fit of {names} did not converge, with whatever tone curve it began", Code.NO_FIT
-        )
+        return Reason(f"only {found}, and the fit of {names} did not converge from any initial tone curve", Code.NO_FIT)
     pairs = zip(frame.layout.marks, frame.detections, strict=True)
     outside = [mark.id for mark, detection in pairs if Code.OUTSIDE in detection.reason.codes]
     if outside and frame.inliers.sum() >= 2:
@@ -347,7 +348,7 @@ def false_frames(result: SearchResult, frame: Frame, indices: Iterable[int]) -> 
 
     Null hypothesis: detections are uniform within the search tolerance. A good fit of many marks by a similarity, with
     or without a stretch, is then improbable. Many places respond as strongly at reduced resolution, but few of them at
-    full resolution: the number is multiplied by their share to the power of at most `_COUNTED` marks.
+    full resolution: the number is multiplied by their share to the power of at most `_MOST_COUNTED` marks.
     """
     placement, found_px = frame.placement, {index: frame.inlier_fits[index].center_px for index in indices}
     widest_px, expected = result.searches[placement.pitch_mm].tolerance_px, list[float]()
@@ -356,9 +357,9 @@ def false_frames(result: SearchResult, frame: Frame, indices: Iterable[int]) -> 
         tolerance_px = min(max(misfit_px, NARROW * widest_px), widest_px)
         expected.append(len(stretches) * _false_alarms(result, placement, found_px, frame.inside_count, tolerance_px))
     at_reduced = _CRITERIA * min(expected)
-    if placement.reduction == 1 or not _SELDOM < at_reduced < _HOPELESS:
+    if placement.reduction == 1 or not _RARE_FRAMES < at_reduced < _FREQUENT_FRAMES:
         return at_reduced
-    return at_reduced * _share_at_full_resolution(result, frame, found_px) ** min(_COUNTED, len(found_px))
+    return at_reduced * _share_at_full_resolution(result, frame, found_px) ** min(_MOST_COUNTED, len(found_px))
 
 
 def _share_at_full_resolution(result: SearchResult, frame: Frame, found_px: Mapping[int, Array]) -> float:
@@ -447,14 +448,18 @@ def doubt_frame(result: SearchResult, frame: Frame) -> Reason:
     if len(clear) < inside:
         matches, places = random_matches(frame, clear)
         hits = max(matches.values(), default=places)
-        chance = float(bdtrc(len(clear) - _FREE - 1, inside - _FREE, _share(hits, places)))
-        if chance <= FRAME_DOUBT_P:
+        p_value = float(bdtrc(len(clear) - _FREE - 1, inside - _FREE, _share(hits, places)))
+        if p_value <= FRAME_DOUBT_P:
             return NO_REASON
         unmatched = sum(each == 0 for each in matches.values())
         return Reason(
             f"only {len(clear)} of {inside} marks were found, and {hits} of {places} random places match "
-            f"as well (p = {chance:.2f}): the frame may lie elsewhere",
-            *((Code.CHANCE, Code.NO_FRAME) if chance > FRAME_REJECTED_P or unmatched < frame.least else (Code.CHANCE,)),
+            f"as well (p = {p_value:.2f}): the frame may lie elsewhere",
+            *(
+                (Code.CHANCE, Code.NO_FRAME)
+                if p_value > FRAME_REJECTED_P or unmatched < frame.least
+                else (Code.CHANCE,)
+            ),
         )
     if len(clear) <= _FREE or not result.is_exhaustive(frame.placement):
         return NO_REASON

@@ -267,7 +267,7 @@ def cross(arm_mm: float, line_mm: float, gap_mm: float = 0.0, angle_deg: float =
     else:
         directions = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
         bars = tuple(Bar((gap_mm * x, gap_mm * y), (arm_mm * x, arm_mm * y), line_mm) for x, y in directions)
-    return tuple(turned_part(bar, angle_deg) for bar in bars)
+    return tuple(rotate_part(bar, angle_deg) for bar in bars)
 
 
 def dot(radius_mm: float) -> tuple[Part, ...]:
@@ -309,16 +309,16 @@ def frame_corner(xy_mm: Point, reach_mm: float, radius_mm: float = 0.0, polarity
     return FrameCorner(square, polarity, toward, reach_mm, radius_mm)
 
 
-def turned(mark: Mark, angle_deg: float) -> Mark:
+def rotate_mark(mark: Mark, angle_deg: float) -> Mark:
     """Rotate a mark counter-clockwise around its origin."""
     if isinstance(mark, MarkTemplate):
         return replace(mark, turn_deg=mark.turn_deg + angle_deg)
-    parts = tuple(turned_part(part, angle_deg) for part in mark.parts)
+    parts = tuple(rotate_part(part, angle_deg) for part in mark.parts)
     true = mark.true_mm and _turned_rectangle(mark.true_mm, angle_deg)
     return replace(mark, parts=parts, perspective=_turned_point(mark.perspective, angle_deg), true_mm=true)
 
 
-def turned_part(part: Part, angle_deg: float) -> Part:
+def rotate_part(part: Part, angle_deg: float) -> Part:
     """Rotate a part counter-clockwise around the mark's origin; quarter turns are exact."""
     if isinstance(part, Polygon):
         return Polygon(tuple(_turned_point(vertex, angle_deg) for vertex in part.vertices_mm))

@@ -122,7 +122,7 @@ def adjust_picture(shared: SharedPicture, stack: Array, steady: Mask) -> SharedP
     found = _bounded(shared.variances_px2, np.array([fit.blur_px2 for fit in fits]))
     sharpest = float((found + _SURELY * np.array([fit.blur_sigma_px2 for fit in fits])).min())
     variances = np.maximum(found - sharpest, 0.0)
-    together = _Together(shared.image, variances, weights, steady)
+    together = _JointAdjustment(shared.image, variances, weights, steady)
     image, more = together.solved(np.array([fit.levelled for fit in fits]))
     moves = np.clip(-more[:, [_COL, _ROW]], -_LONGEST_PX, _LONGEST_PX)
     return SharedPicture(
@@ -210,7 +210,7 @@ def _bounded(variances_px2: Array, change_px2: Array) -> Array:
     return np.clip(total + change_px2, total / _MOST_BLURRED**2, total * _MOST_BLURRED**2) - _SEEN_PX2
 
 
-class _Together:
+class _JointAdjustment:
     """Linearised simultaneous adjustment of the shared image and the unknowns of all images, solved by LSMR.
 
     Datum: the blur of the sharpest images is held fixed, and the sums of the other unknowns are zero, since a common

@@ -19,11 +19,11 @@ from measure.noise.noise_model import (
     SCALE_VARIANCE,
     NoiseModel,
     autocovariance,
-    combined,
-    correlated,
-    factors,
-    faded,
-    products,
+    combine,
+    correlate,
+    inner_products,
+    least_squares_factors,
+    taper,
 )
 from measure.noise.robust_estimation import robust_scale
 from measure.results import Covariance, MarkFit, OwnShape, SecondPlace
@@ -75,20 +75,20 @@ class LinearFit:
         """(n, n) covariance by noise of n quantities with derivatives by_grey (n, height, width) with respect to the
         grey values."""
         white = self.noise.variance_dn2 * by_grey
-        covariance = products(by_grey, white if self.noise.is_white else correlated(by_grey, self.noise))
+        covariance = inner_products(by_grey, white if self.noise.is_white else correlate(by_grey, self.noise))
         return np.asarray((covariance + covariance.T) / 2)
 
-    def unlike_drawing_px2(self, by_noise: Array) -> Array:
+    def model_misfit_px2(self, by_noise: Array) -> Array:
         """(2, 2) covariance of the place due to model misfit: correlated residuals at the mark's edges in excess of the
         noise. by_noise (2, 2) px2: covariance due to noise."""
         place, left = self.by_grey[:2], np.where(self.used, self.residuals, 0.0)[None]
         expected = self.covariance(place)
         if self.noise.is_grain:  # whiten, so that neighbours are uncorrelated under the null hypothesis
-            place, left = correlated(place, self.noise, 0.5), correlated(left, self.noise, -0.5)
-            expected = products(place, place)
+            place, left = correlate(place, self.noise, 0.5), correlate(left, self.noise, -0.5)
+            expected = inner_products(place, place)
         shares = place * left
         about = _smooth(shares, _ALIKE_PX) * (2 * np.pi * _ALIKE_PX**2)
-        more = products(about, shares) - expected
+        more = inner_products(about, shares) - expected
         sizes, axes = eigh((more + more.T) / 2, by_noise)
         axes = by_noise @ axes
         return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)
@@ -118,9 +118,9 @@ class LinearFit:
         design = self.design * area
         halves = (np.sign(across)[:, None] * design[:2]).reshape(-1, *area.shape)
         images = np.concatenate([halves, (self.residuals * area)[None]])
-        by_design = products(images, design) @ np.linalg.pinv(products(design, design), hermitian=True)
-        left = images - combined(by_design, design)
-        squares = products(left, left)
+        by_design = inner_products(images, design) @ np.linalg.pinv(inner_products(design, design), hermitian=True)
+        left = images - combine(by_design, design)
+        squares = inner_products(left, left)
         best, shift = _BY_HALVES * float(squares[-1, -1]), np.asarray(np.zeros(2), float)
         for split in range(0, len(halves), 2):
             own = slice(split, split + 2)
@@ -143,7 +143,7 @@ class LinearFit:
                 continue
             texture = np.where(side, self._uncut, 0.0)
             texture[side] -= texture[side].mean()
-            lags = faded(autocovariance(texture, side, _TEXTURE_PX))
+            lags = taper(autocovariance(texture, side, _TEXTURE_PX))
             # Of neighbours: noise of single pixels is accounted for elsewhere.
             alike = lags[_TEXTURE_PX, _TEXTURE_PX + 1]
             if alike <= 0.0:
@@ -159,9 +159,9 @@ class LinearFit:
         lag2 = np.add.outer(*2 * [np.arange(-reach, reach + 1) ** 2])
         pixels = 4 * np.pi * _SMOOTH_PX**2  # effective area of the smoothing kernel
         noise_dn2 = float(np.sum(self.noise.autocovariance_dn2 * np.exp(-lag2 / (4 * _SMOOTH_PX**2))) / pixels)
-        chance = 3 * np.sqrt(2 * SCALE_VARIANCE * pixels / side.sum())
+        least_excess = 3 * np.sqrt(2 * SCALE_VARIANCE * pixels / side.sum())
         beyond_dn2 = robust_scale(np.asarray(smooth[side], np.float64)) ** 2 - noise_dn2
-        return beyond_dn2 if beyond_dn2 > chance * noise_dn2 else 0.0
+        return beyond_dn2 if beyond_dn2 > least_excess * noise_dn2 else 0.0
 
     @property
     def _uncut(self) -> Array:
@@ -192,12 +192,12 @@ def second_order(design: Array, slopes: Array, used: Mask, covariance: Array, pr
     # Second derivatives by the place: minus the gradients of all columns that move with the mark.
     whole = design[:moving] / np.maximum(slopes, _LEAST_SLOPE)
     changes = np.concatenate(np.gradient(whole, axis=(2, 1))) * (-slopes * used)
-    normal, shared = products(used_design, used_design), products(used_design, changes)
+    normal, shared = inner_products(used_design, used_design), inner_products(used_design, changes)
     inverse: Array = np.asarray(np.linalg.inv(normal + np.diag(priors_dn2)), float)
     taken_up = np.asarray(inverse @ shared, float)
     by_unknown = np.trace(taken_up[:2].reshape(2, 2, moving))  # minus the derivatives of the variance's logarithm
     both = taken_up.T @ shared
-    left = products(changes, changes) - both - both.T + taken_up.T @ normal @ taken_up
+    left = inner_products(changes, changes) - both - both.T + taken_up.T @ normal @ taken_up
     turning = np.einsum("jl,ijml->im", among, left.reshape(2, moving, 2, moving))
     by_noise = np.asarray(inverse @ normal @ inverse, float)
     curvature = np.trace(by_noise[:2, :2] @ turning) / 2
@@ -217,7 +217,7 @@ def second_order(design: Array, slopes: Array, used: Mask, covariance: Array, pr
 
 
 @dataclass(frozen=True, eq=False)
-class Landscape:
+class BackgroundTexture:
     """Background texture within a mark, assumed to vary as in the frame around it.
 
     light: (height, width) grey values; frame_pixels: mask of those that show the frame; share: (height, width) fraction
@@ -241,10 +241,12 @@ class Landscape:
         return _covariance_by_texture(by_grey * self.share, lags)
 
 
-def place_covariance(fit: PictureFit, linear: LinearFit, covariance: Array, landscape: Landscape) -> Covariance:
+def place_covariance(
+    fit: PictureFit, linear: LinearFit, covariance: Array, background: BackgroundTexture
+) -> Covariance:
     """Covariance of the place by its causes. covariance (unknowns, unknowns): by noise, rounding included."""
     model, by_grey, by_noise = fit.model, linear.by_grey, covariance[:2, :2]
-    rounded = fit.rounding_variance_dn2 * np.trace(products(by_grey[:2], by_grey[:2]))
+    rounded = fit.quantisation_variance_dn2 * np.trace(inner_products(by_grey[:2], by_grey[:2]))
     share = min(float(rounded / np.trace(by_noise)), 1.0)
     place = Covariance.from_noise((1 - share) * by_noise).plus(Cause.ROUNDING, share * by_noise)
     priors_dn2 = model.prior_weights * linear.noise.variance_dn2
@@ -253,13 +255,13 @@ def place_covariance(fit: PictureFit, linear: LinearFit, covariance: Array, land
     if isinstance(model.mark, MarkTemplate) and model.mark.steadiness is not None:
         change = fit.contrast_dn / float(np.ptp(model.mark.image))
         place = place.plus(Cause.CHANGED_TONES, covariance_of_changed_tone(model.half_tones, by_grey, change))
-    place = place.plus(Cause.LANDSCAPE, landscape.covariance(by_grey[:2]))
-    place = place.plus(Cause.UNLIKE_DRAWING, linear.unlike_drawing_px2(by_noise))
+    place = place.plus(Cause.NOTCH_BACKGROUND, background.covariance(by_grey[:2]))
+    place = place.plus(Cause.MODEL_MISFIT, linear.model_misfit_px2(by_noise))
     place = place.plus(Cause.DAMAGE, linear.damage_px2(fit.area & ~fit.used))
-    halves = linear.halves_px2(fit.area & model.tells, fit.state.pixel_from_mark[:, 2])
-    place = place.plus(Cause.UNLIKE_DRAWING, halves)
+    halves = linear.halves_px2(fit.area & model.informative, fit.state.pixel_from_mark[:, 2])
+    place = place.plus(Cause.MODEL_MISFIT, halves)
     if not model.is_chip and model.background_px is None:
-        place = place.plus(Cause.TEXTURE, linear.texture_px2(fit.area & model.tells))
+        place = place.plus(Cause.TEXTURE, linear.texture_px2(fit.area & model.informative))
     return place
 
 
@@ -272,7 +274,7 @@ def _covariance_by_texture(by_grey: Array, lags: Array) -> Array:
     """(n, n) covariance of quantities with derivatives by_grey (n, height, width) with respect to the grey values, by
     texture with an autocovariance (lags, lags)."""
     reach = len(lags) // 2
-    covariance = products(by_grey, correlated(by_grey, NoiseModel(float(lags[reach, reach]), lags, 1.0)))
+    covariance = inner_products(by_grey, correlate(by_grey, NoiseModel(float(lags[reach, reach]), lags, 1.0)))
     sizes, axes = np.linalg.eigh((covariance + covariance.T) / 2)  # noisy far lags may give negative eigenvalues
     return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)
 
@@ -288,7 +290,7 @@ def covariance_of_changed_tone(half_tones: Array, by_grey: Array, contrast_chang
     contrast_change : contrast over that of the images from which the chip was learned.
     """
     bent = _HALF_TONES * min(abs(float(np.log(contrast_change))), _MOST)
-    moved = bent * products(by_grey[:2], half_tones[None])
+    moved = bent * inner_products(by_grey[:2], half_tones[None])
     return np.asarray(moved @ moved.T)
 
 
@@ -308,10 +310,10 @@ def edge_place(fit: LinearFit, blur_px: float) -> SecondPlace | None:
     derivative across an edge, under a Gaussian. Summed along the outline this gives an independent place. It does not
     depend on gain, offset and smooth background, nor on the drawing where opposite edges are alike.
     """
-    weights = across_edges(fit.design[:2] * fit.used, max(_SMOOTHING * blur_px, _LEAST_SMOOTHING_PX)) * fit.used
-    response = products(weights, fit.design)
+    weights = edge_weights(fit.design[:2] * fit.used, max(_SMOOTHING * blur_px, _LEAST_SMOOTHING_PX)) * fit.used
+    response = inner_products(weights, fit.design)
     # The residuals no longer contain the noise absorbed by the match: subtract that part of the weights.
-    return _second_place(fit, np.eye(2), response[:, :2], weights, weights - combined(response, fit.by_grey))
+    return _second_place(fit, np.eye(2), response[:, :2], weights, weights - combine(response, fit.by_grey))
 
 
 def sloping_place(fit: LinearFit) -> SecondPlace | None:
@@ -322,8 +324,8 @@ def sloping_place(fit: LinearFit) -> SecondPlace | None:
     The additional unknowns absorb that.
     """
     sloping = fit.design[-GREY] * fit.design[-2:] * fit.used
-    left = (sloping - combined(products(sloping, fit.design), fit.by_grey)) * fit.used  # not absorbed by the match
-    return _second_place(fit, -products(fit.by_grey[:2], sloping), products(left, sloping), left, left)
+    left = (sloping - combine(inner_products(sloping, fit.design), fit.by_grey)) * fit.used  # not absorbed by the match
+    return _second_place(fit, -inner_products(fit.by_grey[:2], sloping), inner_products(left, sloping), left, left)
 
 
 def line_width(fit: LinearFit, change: Array, held: int) -> tuple[float, float]:
@@ -339,11 +341,11 @@ def line_width(fit: LinearFit, change: Array, held: int) -> tuple[float, float]:
     Logarithm of the width over the drawn one, and its standard deviation; infinite where it is not determined.
     """
     others, change = np.delete(fit.design, held, axis=0) * fit.used, change * fit.used
-    left = (change - combined(factors(others, change), others))[None]
-    normal, variance = float(products(left, change[None])[0, 0]), float(fit.covariance(left)[0, 0])
+    left = (change - combine(least_squares_factors(others, change), others))[None]
+    normal, variance = float(inner_products(left, change[None])[0, 0]), float(fit.covariance(left)[0, 0])
     if not (normal > 0 and variance > 0):
         return 0.0, np.inf
-    return float(products(left, fit.residuals[None])[0, 0]) / normal, float(np.sqrt(variance)) / normal
+    return float(inner_products(left, fit.residuals[None])[0, 0]) / normal, float(np.sqrt(variance)) / normal
 
 
 def _second_place(fit: LinearFit, by_unknown: Array, normal: Array, weights: Array, left: Array) -> SecondPlace | None:
@@ -363,13 +365,13 @@ def _second_place(fit: LinearFit, by_unknown: Array, normal: Array, weights: Arr
     if not np.linalg.cond(normal) < _WORST_CONDITION:
         return None
     by_sums = np.asarray(by_unknown @ np.linalg.inv(normal), float)
-    covariance_px2 = fit.covariance(combined(by_sums, left))
+    covariance_px2 = fit.covariance(combine(by_sums, left))
     if not np.all(np.linalg.eigvalsh(covariance_px2) > 0):
         return None
-    return SecondPlace(by_sums @ products(weights, fit.residuals[None])[:, 0], covariance_px2)
+    return SecondPlace(by_sums @ inner_products(weights, fit.residuals[None])[:, 0], covariance_px2)
 
 
-def across_edges(slopes: Array, smoothing_px: float) -> Array:
+def edge_weights(slopes: Array, smoothing_px: float) -> Array:
     """(2, height, width) weights of the grey values in the sums, along columns and rows, of second derivatives across
     the edges. slopes (2, height, width): gradient of the mark's image."""
     square = np.maximum((slopes**2).sum(axis=0), 1e-300)
@@ -412,7 +414,7 @@ def own_shape(fit: LinearFit, shape: slice, strain: slice, departures: Array) ->
     -------
     OwnShape, or None where the image determined them anyway or does not determine them at all.
     """
-    resolution = products(fit.by_grey, fit.design)
+    resolution = inner_products(fit.by_grey, fit.design)
     if np.diag(resolution)[shape].min() > _OWN:
         return None
     let_go = resolution.copy()  # its inverse removes the priors, except those of the strain
@@ -421,11 +423,11 @@ def own_shape(fit: LinearFit, shape: slice, strain: slice, departures: Array) ->
         freed = np.asarray(np.linalg.inv(let_go), float)[shape]
     except np.linalg.LinAlgError:
         return None
-    by_noise = combined(freed, fit.by_grey)
+    by_noise = combine(freed, fit.by_grey)
     variance = np.diag(fit.covariance(by_noise))
     if not np.all(variance > 0):
         return None
-    change = products(by_noise, np.where(fit.used, fit.residuals, 0.0)[None])[:, 0]
+    change = inner_products(by_noise, np.where(fit.used, fit.residuals, 0.0)[None])[:, 0]
     return OwnShape(change + freed @ resolution @ departures, np.sqrt(variance), -resolution[:2, shape])
 
 
@@ -447,7 +449,7 @@ def honest_covariance(template: MarkTemplate, scan: str, fit: MarkFit) -> Covari
     slopes = np.stack([shown.by_col, shown.by_row]).astype(float)
     noise = template.slope_noise_dn / max(float(np.ptp(template.image)), 1e-9) / px_per_sample
     noise *= SMOOTHED_PX2 / blur_px2  # blur reduces the slopes of white noise by this factor
-    squares, axes = np.linalg.eigh(products(slopes, slopes))
+    squares, axes = np.linalg.eigh(inner_products(slopes, slopes))
     marks = np.maximum(squares - noise**2 * side**2, _LEAST_SQUARES * squares)  # squared slopes of the mark itself
     return fit.place_covariance.through(np.asarray(axes * (squares / marks) @ axes.T) / np.sqrt(1.0 - share))
 
@@ -459,7 +461,7 @@ def _covariance_of_noise(template: MarkTemplate, fit: MarkFit) -> Array:
     place = np.column_stack([fit.pixel_from_mark[:, :2], np.full(2, side / 2)])
     shown = render(template, place, side, side, 0.0)
     columns = [fit.contrast_dn * shown.by_col, fit.contrast_dn * shown.by_row, shown.value, np.ones_like(shown.value)]
-    normal = products(np.stack(columns), np.stack(columns))
+    normal = inner_products(np.stack(columns), np.stack(columns))
     size = np.sqrt(np.diag(normal))
     inverse = np.linalg.pinv(normal / np.outer(size, size)) / np.outer(size, size)
     # 4 pi GRAIN_PX^2: sum of the grain's correlations, the number of pixels per independent observation.

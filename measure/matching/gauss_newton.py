@@ -10,10 +10,18 @@ from measure.array_types import Array, Mask
 from measure.flags import NO_REASON, Code, Reason
 from measure.marks.rendering import chip_mask, picture, true_mask
 from measure.marks.shapes import MarkTemplate
-from measure.matching.models import BENT, GREY, ROUGHLY_BENT, ROUNDING_DN, FitState, PictureModel
+from measure.matching.models import BENT, GREY, QUANTISATION_DN, ROUGHLY_BENT, FitState, PictureModel
 from measure.matching.window import ScanWindow, noise_scale
-from measure.noise.noise_model import NoiseModel, combined, correlated, may_be_noise, products, steadiness, weighted
-from measure.noise.robust_estimation import damage, grown, robust_scale, solution, tukey_loss, tukey_weights
+from measure.noise.noise_model import (
+    NoiseModel,
+    combine,
+    correlate,
+    gls_weights,
+    inner_products,
+    may_be_noise,
+    steadiness,
+)
+from measure.noise.robust_estimation import damage, dilate_mask, robust_scale, solution, tukey_loss, tukey_weights
 
 UNSETTLED = Reason("the adjustment did not converge", Code.NO_FIT)
 UNDETERMINED = Reason("the picture does not determine the mark's place", Code.NO_FIT)
@@ -169,12 +177,12 @@ class PictureFit:
         for round_ in range(self.options.damage_rounds):
             if self.reason:
                 return
-            shown, lossy = self.area & self.model.tells, self.window.is_lossy
+            shown, lossy = self.area & self.model.informative, self.window.is_lossy
             undamaged = self.area & ~damage(self.model.residuals, shown, _DAMAGE_SIGMAS, self.floor_dn, lossy)
             if round_ > 0 and np.array_equal(undamaged, self.used):
                 return
             self.used = undamaged
-            if self.telling.sum() < 3 * len(self.model.design):
+            if self.informative.sum() < 3 * len(self.model.design):
                 self.reason = Reason("too little of the mark is undamaged", Code.COVERED)
             elif round_ == 0 and not self._is_plain():
                 self.reason = Reason("the background of the mark is not uniform", Code.NO_FIT)
@@ -212,15 +220,17 @@ class PictureFit:
             model.linearise(self.used)  # a refit has none of its drawings yet
             drawn, shown = model.drawn_light, np.abs(model.design[-GREY] / model.steadiness)
             ground = shown < _GROUND * shown.max()
-            model.take_steadiness(steadiness(model.light - drawn, drawn / coding.full_scale_dn, ground, self.telling))
+            model.take_steadiness(
+                steadiness(model.light - drawn, drawn / coding.full_scale_dn, ground, self.informative)
+            )
         if model.is_clipped:
-            noise_dn = max(robust_scale(model.residuals[self.telling]), ROUNDING_DN)
+            noise_dn = max(robust_scale(model.residuals[self.informative]), QUANTISATION_DN)
             if self.used is not self.area:  # damage is masked: the rest is noise
-                least_dn = max(self.floor_dn, ROUNDING_DN)
+                least_dn = max(self.floor_dn, QUANTISATION_DN)
                 noise_dn = noise_scale(model.uncensored[self.used], model.clipped[self.used], noise_dn, least_dn)
             model.take_noise(noise_dn)
         model.linearise(self.used)
-        noise_dn = max(robust_scale(model.residuals[self.telling]), _DRAWN * self.contrast_dn, 1e-9)
+        noise_dn = max(robust_scale(model.residuals[self.informative]), _DRAWN * self.contrast_dn, 1e-9)
         clipping_dn = model.noise_dn if model.is_clipped else 0.0  # noise assumed for clipped grey values
         self.variance_dn2 = max(noise_dn**2, clipping_dn**2)
         self.scale_dn = np.inf
@@ -228,7 +238,7 @@ class PictureFit:
             # Lines thinner than a pixel, or sharpened, deviate from their drawing by far more than the background's
             # noise: by that scale most of the mark would be taken for damage.
             shown = np.abs(model.design[-GREY])
-            own = self.telling & (shown > _OWN * shown[self.area].max(initial=0.0))
+            own = self.informative & (shown > _OWN * shown[self.area].max(initial=0.0))
             misfit_dn = robust_scale(model.residuals[own]) if own.sum() >= _LEAST_AREA_PX else 0.0
             self.scale_dn = max(noise_dn, misfit_dn, _SCALE_FLOOR * self.contrast_dn)
         self.reason = gauss_newton(self, tolerance_px, _ITERATIONS, _HALVINGS).reason
@@ -239,8 +249,8 @@ class PictureFit:
         if weights is None:
             weights = model.design * (self.used * tukey_weights(model.residuals, self.scale_dn))
         priors = model.prior_weights * self.variance_dn2
-        normal = products(weights, model.design) + np.diag(priors)
-        right = products(weights, model.residuals[None])[:, 0] - priors * model.departures
+        normal = inner_products(weights, model.design) + np.diag(priors)
+        right = inner_products(weights, model.residuals[None])[:, 0] - priors * model.departures
         free = np.ones(len(right), dtype=bool)
         step = solution(normal, right, free)
         if step is not None and model.blur_is_held(step):
@@ -280,7 +290,7 @@ class PictureFit:
             return self._plain_covariance(noise)
         model, before = self.model, self.state
         start = before.pixel_from_mark[:, 2]
-        self.weighted, smeared = weighted(model.design, self.used, noise, self.contrast_dn)
+        self.weighted, smeared = gls_weights(model.design, self.used, noise, self.contrast_dn)
         self.variance_dn2, held = 1.0, self.variance_dn2
         settled = gauss_newton(self, _CLOSE_PX, _WEIGHTED_STEPS).moved_px < _SETTLED_PX and not self.failure()
         self.variance_dn2, moved = held, np.asarray(self.state.pixel_from_mark[:, 2] - start)
@@ -304,18 +314,18 @@ class PictureFit:
         variance = max(noise.variance_dn2, _LEAST_VARIANCE_DN2)
         design, bent = self.model.design * self.used, np.sqrt(self.model.curvature)
         plain = design * bent / variance  # residuals scaled to their information
-        smeared = plain * variance if noise.is_white else correlated(plain, noise) * self.used
+        smeared = plain * variance if noise.is_white else correlate(plain, noise) * self.used
         return self._covariance(plain * bent, smeared / bent, self.variance_dn2 / variance)
 
     def _covariance(self, weights: Array, smeared: Array, held: float = 1.0) -> tuple[Array, Array]:
         """Covariance and derivatives, as of `weigh`, from weighted derivatives and the product of the noise covariance
         with them. held: factor of the priors' weights in the adjustment relative to their variances."""
         priors = np.diag(self.model.prior_weights)
-        inverse: Array = np.asarray(np.linalg.inv(products(weights, self.model.design) + held * priors))
-        covariance = np.asarray(inverse @ (products(weights, smeared) + held**2 * priors) @ inverse.T)
+        inverse: Array = np.asarray(np.linalg.inv(inner_products(weights, self.model.design) + held * priors))
+        covariance = np.asarray(inverse @ (inner_products(weights, smeared) + held**2 * priors) @ inverse.T)
         if not np.all(np.linalg.eigvalsh(covariance[:2, :2] + covariance[:2, :2].T) > 0):
             covariance = inverse  # the estimated lags are noisy: fall back to white noise
-        return np.asarray((covariance + covariance.T) / 2), combined(inverse, weights)
+        return np.asarray((covariance + covariance.T) / 2), combine(inverse, weights)
 
     @property
     def contrast_dn(self) -> float:
@@ -328,7 +338,7 @@ class PictureFit:
         return _FLOOR * self.contrast_dn
 
     @property
-    def rounding_variance_dn2(self) -> float:
+    def quantisation_variance_dn2(self) -> float:
         """Variance of rounding to whole grey values; 0 if the values were compressed or smoothed afterwards."""
         model = self.model
         ordinary = self.used & (model.clipped == 0)
@@ -337,9 +347,9 @@ class PictureFit:
         return 0.0 if steps is None else _ROUNDING_VARIANCE * float(np.mean((steps * model.steadiness)[ordinary] ** 2))
 
     @property
-    def telling(self) -> Mask:
+    def informative(self) -> Mask:
         """Mask of the used pixels whose residuals carry information on the noise."""
-        return self.used & self.model.tells
+        return self.used & self.model.informative
 
     @property
     def damaged_fraction(self) -> float:
@@ -362,7 +372,7 @@ class PictureFit:
     @property
     def _clear(self) -> Mask:
         """Mask of the used pixels that are not adjacent to damage."""
-        return self.used if self.window.is_lossy else self.used & ~grown(self.area & ~self.used)
+        return self.used if self.window.is_lossy else self.used & ~dilate_mask(self.area & ~self.used)
 
     def _is_plain(self) -> bool:
         """Whether undamaged pixels far from the mark scatter like the nearer ones."""

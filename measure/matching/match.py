@@ -16,7 +16,7 @@ from measure.array_types import Array, Mask
 from measure.marks.rendering import frame_pixel_mask, known_mask, mark_window, picture
 from measure.marks.shapes import Mark, MarkShape, widen_lines
 from measure.matching.covariance import (
-    Landscape,
+    BackgroundTexture,
     LinearFit,
     edge_place,
     line_width,
@@ -29,7 +29,7 @@ from measure.matching.models import GREY, FitState, MatchOptions, PictureModel, 
 from measure.matching.tone_information import mark_tone_information, sharpening_score
 from measure.matching.window import ScanWindow
 from measure.noise.grain import blank_patches, grain_model, is_coloured
-from measure.noise.noise_model import NoiseModel, as_if_white, combined, factors, is_textured
+from measure.noise.noise_model import NoiseModel, combine, is_textured, least_squares_factors, white_noise_model
 from measure.results import Covariance, MarkFit
 
 _WIDER = 1.05  # relative width of lines, step of the difference
@@ -118,22 +118,22 @@ def _start_fit(
     part = window.part(rows, cols)
     if coarse_px is not None:
         # With the background subtracted, a clipped grey value is no longer a limit: exclude it.
-        part = replace(part.exclude(part.sides != 0), clipped=None)
+        part = replace(part.exclude(part.ends != 0), clipped=None)
     local[:, 2] -= (cols.start, rows.start)
     return PictureFit(PictureModel(part, mark, local, options, coarse_px), part)
 
 
 def _is_right(fit: PictureFit) -> bool:
     """Whether the fit converged and its residuals show no background texture."""
-    return not fit.reason and not is_textured(fit.model.residuals, fit.telling, fit.floor_dn)
+    return not fit.reason and not is_textured(fit.model.residuals, fit.informative, fit.floor_dn)
 
 
 def _mark_fit(fit: PictureFit, window: ScanWindow) -> MarkFit:
     """Convert the fit of a part of a window to a result in pixels of the scan."""
-    model, used = fit.model, fit.telling
+    model, used = fit.model, fit.informative
     information = float(model.information[fit.used].sum())
-    noise, is_white = as_if_white(model.scores, fit.used, len(model.design), information)
-    noise = noise.floored(fit.rounding_variance_dn2)
+    noise, is_white = white_noise_model(model.scores, fit.used, len(model.design), information)
+    noise = noise.raise_variance(fit.quantisation_variance_dn2)
     unknown = np.full((len(model.design),) * 2, np.inf)
     grey = np.asarray(window.grey, float)
     precision: dict[str, Any] = {
@@ -146,7 +146,7 @@ def _mark_fit(fit: PictureFit, window: ScanWindow) -> MarkFit:
         patches = blank_patches(grey, free, noise.variance_dn2)
         if not is_white or is_coloured(patches):
             noise = grain_model(model.residuals, used, model.design, noise.neighbour_correlation, patches)
-        precision = _precision(fit, noise, Landscape(grey, frame, model.design[-GREY]))
+        precision = _precision(fit, noise, BackgroundTexture(grey, frame, model.design[-GREY]))
     # The grain's weights may have moved the mark.
     place = fit.state.shifted(np.asarray(fit.window.origin_px)).pixel_from_mark
     stored_dn = fit.window.coding.stored_contrast_dn(float(fit.state.greys[1]), model.contrast_dn)
@@ -174,7 +174,7 @@ def _surroundings(fit: PictureFit, window: ScanWindow) -> tuple[Mask, Mask]:
     frame, for a mark that is cut into it."""
     offset, (height, width) = np.subtract(fit.window.origin_px, window.origin_px), window.grey.shape
     where = fit.state.shifted(offset).pixel_from_mark, width, height, EDGE_BLURS * fit.model.total_blur_px
-    free = window.usable & (window.sides == 0) & known_mask(fit.model.mark, *where)
+    free = window.usable & (window.ends == 0) & known_mask(fit.model.mark, *where)
     # A chip's window is smoothed for the fit, the blank film around it is not.
     free &= not (window.is_lossy or fit.model.is_chip)
     col, row = np.rint(offset).astype(int)
@@ -182,10 +182,10 @@ def _surroundings(fit: PictureFit, window: ScanWindow) -> tuple[Mask, Mask]:
     return free, window.usable & frame_pixel_mask(fit.model.mark, *where)
 
 
-def _precision(fit: PictureFit, noise: NoiseModel, landscape: Landscape) -> dict[str, Any]:
+def _precision(fit: PictureFit, noise: NoiseModel, background: BackgroundTexture) -> dict[str, Any]:
     """Finish the fit with the weights of its noise. Returns its covariances and derived estimates, attributes of a
     `MarkFit`."""
-    model, used = fit.model, fit.telling
+    model, used = fit.model, fit.informative
     covariance, by_grey = fit.weigh(noise)
     linear = LinearFit(model.residuals, used, model.design, by_grey, noise, model.steadiness)
     freedom, blur = model.options.freedom, model.blur
@@ -199,7 +199,7 @@ def _precision(fit: PictureFit, noise: NoiseModel, landscape: Landscape) -> dict
     if blur is not None and not model.blur_is_at_limit:
         blur_sigma = float(sigmas[blur]) / (2 * model.total_blur_px**2)
     return {
-        "place_covariance": place_covariance(fit, linear, covariance, landscape),
+        "place_covariance": place_covariance(fit, linear, covariance, background),
         "covariance": covariance,
         "lost_fraction": fit.lost_fraction,
         "significance": fit.contrast_dn / max(float(sigmas[-GREY]), 1e-6),
@@ -209,7 +209,7 @@ def _precision(fit: PictureFit, noise: NoiseModel, landscape: Landscape) -> dict
         "sloping": sloping_place(linear) if freedom == "ellipse" and model.background_px is None else None,
         "line_width": width,
         "own_shape": own_shape(linear, shape, strain, model.departures) if tells_shape else None,
-        "tone": mark_tone_information(fit, linear, landscape, by_width),
+        "tone": mark_tone_information(fit, linear, background, by_width),
         "sharpening": sharpening_score(fit, linear, by_width),
     }
 
@@ -231,6 +231,6 @@ def _likeness(fit: PictureFit) -> float:
     background, grey = fit.model.ground * counts, fit.model.grey * counts
     if fit.used.sum() <= len(background):
         return 0.0
-    without = grey - combined(factors(background, grey), background)
+    without = grey - combine(least_squares_factors(background, grey), background)
     unexplained = np.sum(fit.model.misfit[fit.used] ** 2) / max(np.sum(without**2), 1e-12)
     return float(np.sqrt(max(1 - unexplained, 0.0)))

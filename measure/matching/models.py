@@ -12,8 +12,8 @@ from measure.array_types import Array, Mask
 from measure.geometry import linear_scale
 from measure.marks.rendering import Rendering, chip_steadiness, reach_px, render
 from measure.marks.shapes import Mark, MarkTemplate
-from measure.matching.window import ScanWindow, censored
-from measure.noise.noise_model import combined, factors
+from measure.matching.window import ScanWindow, deviance_residuals
+from measure.noise.noise_model import combine, least_squares_factors
 
 Freedom = Literal["shift", "similarity", "affine", "ellipse"]
 FREEDOMS: tuple[Freedom, ...] = get_args(Freedom)
@@ -32,11 +32,11 @@ _FREEDOMS: dict[Freedom, tuple[str, ...]] = {
     "ellipse": ("scale", "stretch", "shear"),
 }
 GREY = 4  # grey-value unknowns, the last ones: gain, offset and two slopes
-ROUNDING_DN = 0.3  # standard deviation of rounding to whole grey values
+QUANTISATION_DN = 0.3  # standard deviation of rounding to whole grey values
 BENT, ROUGHLY_BENT = 0.075, 0.4  # in blurs: outline displacement up to which a Taylor series replaces rendering
 PIXEL_VARIANCE_PX2 = 1 / 12  # px², averaging over the pixel, treated as additional blur
 _AS_NOISY = 0.02  # relative change of the noise below which clipped grey values are not re-evaluated
-_TELLS = 0.5  # slope of a clipped grey value above which its residual counts as an ordinary one
+_INFORMATIVE_SLOPE = 0.5  # slope of a clipped grey value above which its residual counts as an ordinary one
 _LEAST = 1e-300  # lower bound of the squared slope of a clipped grey value, to divide by
 _BLUR_RANGE_PX = (0.3, 6.0)  # px: smaller blur is hidden by the pixel, with larger blur marks are hardly visible
 _LONGEST_SHIFT_PX, _LONGEST_CHANGE = 1.5, 0.1  # px and linear part: longest step for which the linearisation holds
@@ -82,7 +82,7 @@ class MatchOptions:
     plain_px: float = inf
     damage_rounds: int = 3
     max_shift_px: float = 8.0
-    tells_sharpening: bool = False
+    estimate_sharpening: bool = False
 
     def __post_init__(self) -> None:
         if self.freedom not in FREEDOMS:
@@ -138,10 +138,10 @@ class PictureModel:
     grey : (height, width) grey values to be fitted.
     background_px : blur whose result is subtracted as background; None: the background is modelled.
     ground : (3, height, width) offset and slopes of the background.
-    clipped : (height, width) from `clipped_sides`.
+    clipped : (height, width) from `clipped_ends`.
     noise_dn : standard deviation of the noise, needed for clipped grey values.
-    tells : (height, width) False where a clipped grey value carries no information on the noise.
-    slopes, information : (height, width) from `censored`; 1 for ordinary grey values.
+    informative : (height, width) False where a clipped grey value carries no information on the noise.
+    slopes, information : (height, width) from `deviance_residuals`; 1 for ordinary grey values.
     uncensored : (height, width) residuals as if no grey value were clipped; set only where some are.
     steadiness : (height, width) noise of an ordinary pixel over that of each pixel, for a chip from `chip_steadiness`.
         Residuals and design are multiplied by it, so that their noise is uniform.
@@ -152,9 +152,9 @@ class PictureModel:
         self, window: ScanWindow, mark: Mark, start: Array, options: MatchOptions, background_px: float | None = None
     ) -> None:
         self.mark, self.start, self.options, self.background_px = mark, start, options, background_px
-        grey, self.clipped, self.noise_dn = np.asarray(window.grey, float), window.sides, ROUNDING_DN
+        grey, self.clipped, self.noise_dn = np.asarray(window.grey, float), window.ends, QUANTISATION_DN
         self.is_clipped = bool(self.clipped.any())
-        self.tells = np.ones(grey.shape, dtype=bool)
+        self.informative = np.ones(grey.shape, dtype=bool)
         ones, zeros = np.ones((3, *grey.shape)), np.zeros((3, *grey.shape))
         self.slopes: Array = ones[0]
         self.information: Array = ones[1]
@@ -194,7 +194,7 @@ class PictureModel:
         if self._linearised is not None:
             before, residuals = self._linearised
             if not self.has_moved(before, _LINEAR * self.total_blur_px) and not self._is_bent():
-                self.residuals = residuals - combined(self._change(before), self.design)
+                self.residuals = residuals - combine(self._change(before), self.design)
                 return
         height, width = self.grey.shape
         place = self.state.pixel_from_mark
@@ -202,19 +202,19 @@ class PictureModel:
         greys, columns = self.design[-GREY:], self.design[:-GREY]
         greys[0], greys[1:] = self.detail(shown.value), self.ground
         if not self.state.greys.any():
-            self.state = FitState(place, self.state.variance_px2, factors(greys * used, self.grey))
+            self.state = FitState(place, self.state.variance_px2, least_squares_factors(greys * used, self.grey))
         # In single precision, like the rendering.
         col, row = np.arange(width) - place[0, 2], (np.arange(height) - place[1, 2])[:, None]
         slopes = shown.by_col, shown.by_row
         moves = np.stack([slope * along.astype(np.float32) for slope in slopes for along in (col, row)])
         # The blur is not deformed with the mark; otherwise size, blur and contrast of a soft disk diverge together.
         moves += self.total_blur_px**2 * np.stack([shown.by_col_col, *[shown.by_col_row] * 2, shown.by_row_row])
-        moving = [*slopes, *combined(self.generators.reshape(-1, 4).astype(np.float32), moves)]
+        moving = [*slopes, *combine(self.generators.reshape(-1, 4).astype(np.float32), moves)]
         if self.blur is not None:
             moving.append(-0.5 * shown.laplacian)
         columns[:] = [self.detail(image) for image in moving]
         columns *= -self.state.greys[0]
-        self.residuals = self.grey - combined(self.state.greys, greys)
+        self.residuals = self.grey - combine(self.state.greys, greys)
         if isinstance(self.mark, MarkTemplate):
             self.steadiness = chip_steadiness(self.mark, place, width, height)
             self.half_tones = self.steadiness * self.state.greys[0] * self.detail(4 * shown.value * (1 - shown.value))
@@ -225,13 +225,15 @@ class PictureModel:
         self._linearised = self.state, self.residuals
 
     def _censor(self) -> None:
-        """Replace the residuals of clipped grey values by deviance residuals (see `censored`)."""
+        """Replace the residuals of clipped grey values by deviance residuals (see `deviance_residuals`)."""
         clipped = self.clipped != 0
         self.uncensored = self.residuals.copy()
-        deviances, slopes, information = censored(self.residuals[clipped], self.clipped[clipped], self.noise_dn)
+        deviances, slopes, information = deviance_residuals(
+            self.residuals[clipped], self.clipped[clipped], self.noise_dn
+        )
         self.residuals[clipped], self.slopes[clipped], self.information[clipped] = deviances, slopes, information
         self.design[:, clipped] *= slopes
-        self.tells[clipped] = slopes > _TELLS
+        self.informative[clipped] = slopes > _INFORMATIVE_SLOPE
 
     def take_noise(self, noise_dn: float) -> None:
         """Set the standard deviation of the noise for clipped grey values; ignored if the change is negligible."""
@@ -254,7 +256,7 @@ class PictureModel:
         longest = max(np.hypot(*shift) / _LONGEST_SHIFT_PX, largest / _LONGEST_CHANGE, 1.0)
         place = self.state.pixel_from_mark.copy()
         place[:, 2] += shift / longest
-        place[:, :2] += combined(linear / longest, self.generators) @ place[:, :2]
+        place[:, :2] += combine(linear / longest, self.generators) @ place[:, :2]
         variance = self.state.variance_px2
         if self.blur is not None:
             # As a relative change of the total standard deviation, so that a distant blur is reached in one step.

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from measure.array_types import Array, Mask
-from measure.matching.covariance import Landscape, LinearFit
+from measure.matching.covariance import BackgroundTexture, LinearFit
 from measure.matching.gauss_newton import PictureFit
 from measure.matching.models import GREY, PictureModel
-from measure.noise.noise_model import combined, products
+from measure.noise.noise_model import combine, inner_products
 from measure.tone.curve import ToneInformation
 from measure.tone.estimate import MarkTone, ToneScore, tone_score
 from measure.tone.sharpening import SharpeningScore
@@ -19,7 +19,9 @@ _CLEAR = 3.0  # noise standard deviations between the model and a clipping limit
 _LEAST_VARIANCE = 1e-9  # floor of the score's variance relative to that of the departures
 
 
-def mark_tone_information(fit: PictureFit, linear: LinearFit, landscape: Landscape, by_width: Array) -> MarkTone | None:
+def mark_tone_information(
+    fit: PictureFit, linear: LinearFit, background: BackgroundTexture, by_width: Array
+) -> MarkTone | None:
     """Compute the information of a fit on the tone curve, with the fit's unknowns eliminated.
 
     The derivatives by the curve are taken at the modelled light; at the observed one they would be correlated with the
@@ -30,7 +32,7 @@ def mark_tone_information(fit: PictureFit, linear: LinearFit, landscape: Landsca
     Parameters
     ----------
     linear : the fit, linearised at its solution.
-    landscape : background texture within the mark.
+    background : texture within the mark.
     by_width : (n, height, width) derivatives by the width of lines, further unknowns. Otherwise the curve would explain
         lines that are narrower or wider than drawn.
 
@@ -48,12 +50,14 @@ def mark_tone_information(fit: PictureFit, linear: LinearFit, landscape: Landsca
     on_place, information = _moved_px(linear, changes), ToneInformation.empty()
     drawn = model.drawn_light if is_whole else model.light
     if is_whole and _has_contrast(drawn):
-        within = replace(linear, used=linear.used & _clear_of_ends(model), noise=linear.noise.floored(fit.floor_dn**2))
+        within = replace(
+            linear, used=linear.used & _clear_of_ends(model), noise=linear.noise.raise_variance(fit.floor_dn**2)
+        )
         uneven = np.concatenate([_uneven(linear.design[-GREY], linear.steadiness), by_width])
         changes = tone.derivatives(drawn, full_scale_dn) * within.used * linear.steadiness
         priors_dn2 = model.prior_weights * linear.noise.variance_dn2
         score, left, covariance = _score(within, changes, priors_dn2, model.departures, uneven)
-        covariance += landscape.covariance(left) + _least_variances(within, changes).sum() * np.eye(len(left))
+        covariance += background.covariance(left) + _least_variances(within, changes).sum() * np.eye(len(left))
         covariance *= _disagreement(score, left, np.where(within.used, linear.residuals, 0.0), covariance, on_place)
         information = score.information(covariance, tone)
     codes = tone.code(np.quantile(drawn[linear.used], (0.0, 1.0)), full_scale_dn) / full_scale_dn
@@ -65,13 +69,13 @@ def sharpening_score(fit: PictureFit, linear: LinearFit, by_width: Array) -> Sha
     background is not modelled or the model has no contrast. Pixels masked as damage are included, since halos are taken
     for damage until they are modelled."""
     model, tone, full_scale_dn = fit.model, fit.window.coding.tone, fit.window.coding.full_scale_dn
-    needs_sharpening = model.options.tells_sharpening or tone.sharpening
+    needs_sharpening = model.options.estimate_sharpening or tone.sharpening
     if not needs_sharpening or model.background_px is not None or model.is_chip:
         return None
     drawn = model.drawn_light
     if not _has_contrast(drawn):
         return None
-    linear = replace(linear, used=fit.area & model.tells & _clear_of_ends(model))
+    linear = replace(linear, used=fit.area & model.informative & _clear_of_ends(model))
     halos = tone.sharpening.changes(tone.code(drawn, full_scale_dn))
     # Sign: light by a wrong curve lacks the departure, whereas sharpening adds halos to it.
     halos = -tone.slope(drawn, full_scale_dn) * halos
@@ -89,11 +93,11 @@ def _has_contrast(drawn: Array) -> bool:
 def _clear_of_ends(model: PictureModel) -> Mask:
     """(height, width) mask of pixels whose modelled value lies so far from the clipping limits that noise is not cut
     off, which changes an edge as a curve does."""
-    drawn, sides = model.drawn_light, model.clipped
+    drawn, ends = model.drawn_light, model.clipped
     clear = np.ones(drawn.shape, dtype=bool)
     for side in (1, -1):
-        if np.any(sides == side):
-            clear &= side * (model.grey[sides == side].mean() - drawn) > _CLEAR * model.noise_dn
+        if np.any(ends == side):
+            clear &= side * (model.grey[ends == side].mean() - drawn) > _CLEAR * model.noise_dn
     return clear
 
 
@@ -125,7 +129,7 @@ def _disagreement(score: ToneScore, left: Array, residuals: Array, covariance: A
     weighted = np.linalg.solve(covariance, score.normal).T
     estimate: Array = np.asarray(np.linalg.inv(np.eye(len(covariance)) + weighted @ score.normal) @ weighted, float)
     moved = on_place @ estimate
-    images = left * (residuals + combined(estimate @ score.value, left))
+    images = left * (residuals + combine(estimate @ score.value, left))
     count, height, width = images.shape
     whole = np.pad(images, ((0, 0), (0, -height % _PIECE_PX), (0, -width % _PIECE_PX)))
     squares = whole.reshape(count, whole.shape[1] // _PIECE_PX, _PIECE_PX, -1, _PIECE_PX)
@@ -136,7 +140,7 @@ def _disagreement(score: ToneScore, left: Array, residuals: Array, covariance: A
 def _moved_px(fit: LinearFit, changes: Array) -> Array:
     """(2, k) derivatives of the place with respect to the departures. changes (k, height, width): those of the fitted
     light."""
-    return products(fit.by_grey[:2], changes * fit.used * fit.steadiness)
+    return inner_products(fit.by_grey[:2], changes * fit.used * fit.steadiness)
 
 
 def _uneven(shown: Array, about: Array) -> Array:

@@ -10,7 +10,7 @@ from scipy.special import bdtrc, log_ndtr
 from skimage.filters import threshold_otsu
 
 from measure.array_types import Array, Mask
-from measure.flags import NATURAL_END
+from measure.flags import CLIPPED_END
 from measure.marks.rendering import picture
 from measure.marks.shapes import Mark
 from measure.noise.robust_estimation import robust_scale
@@ -18,7 +18,7 @@ from measure.scans.metadata import Samples
 from measure.scans.scan import Scan
 from measure.tone.curve import LINEAR, Tone
 
-Sides = NDArray[np.int8]  # 1: at the upper end of the scanner's range, -1: at the lower one, 0 elsewhere
+ClippedEnds = NDArray[np.int8]  # 1: at the upper end of the scanner's range, -1: at the lower one, 0 elsewhere
 
 FAINT = 1 / 500  # fraction of full scale: a smaller contrast may be rounding
 _BESIDE_PX = 6.0  # px around the drawing: the mark's own background
@@ -87,7 +87,7 @@ class ScanWindow:
     grey : (height, width) light.
     origin_px : (col, row) of the centre of its top-left pixel in the scan.
     valid : (height, width) mask of the valid pixels; None: all.
-    clipped : (height, width) pixels at an end of the scanner's range, from `clipped_sides`; None: none.
+    clipped : (height, width) pixels at an end of the scanner's range, from `clipped_ends`; None: none.
     is_lossy : whether the scan was compressed with loss.
     coded : relation of light to stored grey values; None: grey holds the stored values.
     """
@@ -95,7 +95,7 @@ class ScanWindow:
     grey: NDArray[np.floating]
     origin_px: tuple[float, float] = (0.0, 0.0)
     valid: Mask | None = None
-    clipped: Sides | None = None
+    clipped: ClippedEnds | None = None
     is_lossy: bool = False
     coded: Coding | None = None
 
@@ -110,7 +110,7 @@ class ScanWindow:
         return self.coded or Coding(self.grey)
 
     @property
-    def sides(self) -> Sides:
+    def ends(self) -> ClippedEnds:
         return np.zeros(self.grey.shape, np.int8) if self.clipped is None else self.clipped
 
     def exclude(self, lost: Mask) -> "ScanWindow":
@@ -125,7 +125,7 @@ class ScanWindow:
             self.grey[rows, cols],
             (col0 + cols.start, row0 + rows.start),
             self.usable[rows, cols],
-            self.sides[rows, cols],
+            self.ends[rows, cols],
             self.is_lossy,
             replace(coding, stored=stored),
         )
@@ -138,8 +138,8 @@ def read_window(scan: Scan, place_px: tuple[int, int, int, int], weights: Sequen
     samples, grey = scan.samples(*place_px), scan.light(*place_px, weights).astype(float)
     inside = scan.inside(*place_px, is_read=True)
     stored = grey if scan.tone.is_identity else scan.window(*place_px, weights) if scan.channels == 1 else None
-    sides = clipped_sides(samples, scan.full_scale_dn, weights)
-    return ScanWindow(grey, (col0, row0), inside, sides, scan.is_lossy, Coding(stored, scan.tone, scan.full_scale_dn))
+    ends = clipped_ends(samples, scan.full_scale_dn, weights)
+    return ScanWindow(grey, (col0, row0), inside, ends, scan.is_lossy, Coding(stored, scan.tone, scan.full_scale_dn))
 
 
 def pixels_beyond_edge(window: NDArray[np.floating], mark: Mark, pixel_from_mark: Array) -> Mask:
@@ -176,7 +176,7 @@ def pixels_beyond_edge(window: NDArray[np.floating], mark: Mark, pixel_from_mark
 # Its information is the curvature of that likelihood.
 
 
-def clipped_sides(samples: Samples, full_scale_dn: float, weights: Sequence[float] | None = None) -> Sides:
+def clipped_ends(samples: Samples, full_scale_dn: float, weights: Sequence[float] | None = None) -> ClippedEnds:
     """Find the clipped ones among stored values.
 
     Parameters
@@ -194,17 +194,17 @@ def clipped_sides(samples: Samples, full_scale_dn: float, weights: Sequence[floa
     for bits in _BITS:
         if bits < full_bits:
             limits |= {float(2**bits - 1), float((2**bits - 1) << (full_bits - bits))}
-    sides = np.zeros(samples.shape[:2], np.int8)
+    ends = np.zeros(samples.shape[:2], np.int8)
     for channel in range(samples.shape[2]):
         if weights is None or weights[channel] > 0:
             grey = samples[..., channel]
             if grey.max() in limits or _is_cut(grey):
-                sides[grey == grey.max()] = 1
-            sides[grey == 0] = -1
-    return sides
+                ends[grey == grey.max()] = 1
+            ends[grey == 0] = -1
+    return ends
 
 
-def censored(residuals: Array, sides: Sides, sigma_dn: float) -> tuple[Array, Array, Array]:
+def deviance_residuals(residuals: Array, ends: ClippedEnds, sigma_dn: float) -> tuple[Array, Array, Array]:
     """Compute the deviance residuals of clipped grey values. residuals (n,): grey value minus model; sides (n,):
     clipped end; sigma_dn: standard deviation of the noise.
 
@@ -213,23 +213,23 @@ def censored(residuals: Array, sides: Sides, sigma_dn: float) -> tuple[Array, Ar
     Deviance residuals (n,), their derivatives with respect to the ordinary residuals, 0 to 1, and their information
     relative to an ordinary grey value, one to two times the squared derivative.
     """
-    within = sides * residuals / sigma_dn
-    log_chance = np.asarray(log_ndtr(-within), dtype=float)
-    hazard = _hazard(within, log_chance)
-    size = np.sqrt(np.maximum(-2 * log_chance, 1e-300))
+    within = ends * residuals / sigma_dn
+    log_probability = np.asarray(log_ndtr(-within), dtype=float)
+    hazard = _hazard(within, log_probability)
+    size = np.sqrt(np.maximum(-2 * log_probability, 1e-300))
     slopes = np.minimum(hazard / size, 1.0)
-    return sides * sigma_dn * size, slopes, np.clip(hazard * (hazard - within), slopes**2, 2 * slopes**2)
+    return ends * sigma_dn * size, slopes, np.clip(hazard * (hazard - within), slopes**2, 2 * slopes**2)
 
 
-def noise_scale(residuals: Array, sides: Sides, start_dn: float, least_dn: float) -> float:
+def noise_scale(residuals: Array, ends: ClippedEnds, start_dn: float, least_dn: float) -> float:
     """Estimate the standard deviation of the noise by maximum likelihood from residuals and sides (n,), some clipped.
 
     Returns at least least_dn; start_dn: rough initial value. The mean square of an observation's score (its residual
     if ordinary) equals its information in units of the variance. Residuals more than _GROSS standard deviations within
     the range are damage.
     """
-    clipped = sides != 0
-    ordinary, within = residuals[~clipped], (sides * residuals)[clipped]
+    clipped = ends != 0
+    ordinary, within = residuals[~clipped], (ends * residuals)[clipped]
     ordinary, within = ordinary[np.abs(ordinary) < _GROSS * start_dn], within[within < _GROSS * start_dn]
     squares, sigma = float(np.sum(ordinary**2)), max(start_dn, least_dn)
     for _ in range(_SCALE_ROUNDS):
@@ -240,9 +240,9 @@ def noise_scale(residuals: Array, sides: Sides, start_dn: float, least_dn: float
     return sigma
 
 
-def _hazard(within: Array, log_chance: Array) -> Array:
+def _hazard(within: Array, log_probability: Array) -> Array:
     """Hazard function of the normal distribution: density over tail probability."""
-    return np.asarray(np.exp(_LOG_DENSITY - within**2 / 2 - log_chance))
+    return np.asarray(np.exp(_LOG_DENSITY - within**2 / 2 - log_probability))
 
 
 def _is_cut(grey: Samples) -> bool:
@@ -258,4 +258,4 @@ def _is_cut(grey: Samples) -> bool:
     if both_below.sum() < _FEWEST or not sigma > _LEAST_STEPS * step:
         return False
     tail = int((grey >= float(greatest) - _TAIL * sigma).sum())
-    return bool(bdtrc(pile - 1, tail, step / (_TAIL * sigma)) < NATURAL_END)
+    return bool(bdtrc(pile - 1, tail, step / (_TAIL * sigma)) < CLIPPED_END)

@@ -1,7 +1,7 @@
 """Noise model of the residuals of a fit: white scanner noise plus film grain of several sizes.
 
 Isotropic noise whose correlation falls with distance is well described by a sum of grains with Gaussian correlation:
-film needs one or two sizes, a landscape, with detail of all sizes, many.
+film needs one or two sizes, image texture, with detail of all sizes, many.
 
 The autocovariance of the residuals is biased: each unknown absorbs noise, mostly at the low frequencies where it is
 strongest, and in a small window the covariance comes out too small. The model therefore predicts the autocovariance
@@ -18,7 +18,7 @@ from scipy import fft
 from scipy.optimize import nnls
 
 from measure.array_types import Array, Mask, Single
-from measure.noise.noise_model import NoiseModel, padded
+from measure.noise.noise_model import NoiseModel, transform_size
 
 Lags = NDArray[np.intp]  # (n, 2) rows and columns between pixels, all of one length
 
@@ -98,7 +98,7 @@ def grain_model(residuals: Array, used: Mask, design: Array, neighbour_correlati
     lags = np.tensordot(nnls((expected * weights).T, left * weights)[0], _KERNELS, axes=1)
     variance, neighbours = lags[_REACH_PX, _REACH_PX], lags[_REACH_PX, _REACH_PX + 1]
     # A fit lowers the correlation of residuals. If it is still above that of the coarsest grain, in the residuals or in
-    # the model, a landscape was taken for grain.
+    # the model, image texture was taken for grain.
     alike, most = max(neighbour_correlation, neighbours / max(variance, 1e-300)), np.exp(-1 / (4.0 * _COARSEST_PX**2))
     return NoiseModel(float(variance), lags, neighbour_correlation, bool(len(blank) and alike < most))
 
@@ -128,7 +128,7 @@ def taken_out(used: Mask, design: Array, farthest_px: float = _FARTHEST_PX) -> A
     significant = values > _ALIKE * values[-1]
     orthonormal = (vectors[:, significant] / np.sqrt(values[significant])).T / size
     base[: len(orthonormal), within] = orthonormal @ used_design
-    shape = padded(within.shape, _REACH_PX)
+    shape = transform_size(within.shape, _REACH_PX)
     spectra = np.conj(fft.rfft2(base, s=shape))
     flat, counted = base.reshape(len(base), -1), within.ravel().astype(np.float32)
     taken = []
@@ -142,7 +142,7 @@ def taken_out(used: Mask, design: Array, farthest_px: float = _FARTHEST_PX) -> A
 
 def _pixel_products(images: Array | Mask, rings: Sequence[Lags]) -> Array:
     """(distances,) sums over images (n, height, width) of products of pixels at each distance."""
-    shape = padded(images.shape[1:], _REACH_PX)
+    shape = transform_size(images.shape[1:], _REACH_PX)
     lags = fft.irfft2((np.abs(fft.rfft2(images.astype(np.float32), s=shape)) ** 2).sum(axis=0), s=shape)
     return np.array([lags[*ring.T].sum() for ring in rings])
 

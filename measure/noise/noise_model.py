@@ -28,21 +28,21 @@ _CLOSE = 0.03  # relative residual of a derivative that costs 0.001 of the stand
 _MISFIT = 0.003  # model error from pixel to pixel, in contrasts
 
 
-def combined(factors: Array, images: Array) -> Array:
+def combine(factors: Array, images: Array) -> Array:
     """Linear combination of images (n, height, width) with factors (n,) to one image, or (m, n) to m images."""
     sums = factors @ images.reshape(len(images), prod(images.shape[1:]))
     return np.asarray(sums.reshape(*factors.shape[:-1], *images.shape[1:]))
 
 
-def products(first: Array, second: Array) -> Array:
+def inner_products(first: Array, second: Array) -> Array:
     """(n, m) inner products of images (n, height, width) and (m, height, width)."""
     return np.asarray(first.reshape(len(first), -1) @ second.reshape(len(second), -1).T)
 
 
-def factors(images: Array, image: Array) -> Array:
+def least_squares_factors(images: Array, image: Array) -> Array:
     """(n,) least-squares factors of images (n, height, width), 0 where not used, that approximate an image."""
-    inverse = np.linalg.pinv(products(images, images), hermitian=True)
-    return np.asarray(inverse @ products(images, image[None])[:, 0])
+    inverse = np.linalg.pinv(inner_products(images, images), hermitian=True)
+    return np.asarray(inverse @ inner_products(images, image[None])[:, 0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class NoiseModel:
     variance_dn2 : of one pixel.
     autocovariance_dn2 : (2 reach + 1, 2 reach + 1) by lag; (1, 1) for white noise.
     neighbour_correlation : mean correlation of pixels that touch along an edge.
-    is_grain : whether blank film confirms it; residuals of a fit alone may be those of a landscape.
+    is_grain : whether blank film confirms it; residuals of a fit alone may be image texture.
     """
 
     variance_dn2: float
@@ -66,7 +66,7 @@ class NoiseModel:
     def is_white(self) -> bool:
         return self.autocovariance_dn2.size == 1
 
-    def floored(self, variance_dn2: float) -> "NoiseModel":
+    def raise_variance(self, variance_dn2: float) -> "NoiseModel":
         """Scale the noise to at least this variance."""
         if not self.variance_dn2:  # no noise at all: nothing to scale
             return NoiseModel(variance_dn2, np.full((1, 1), variance_dn2), 0.0, self.is_grain)
@@ -81,10 +81,10 @@ def noise_model(residuals: Array, used: Mask, unknowns: int) -> NoiseModel:
 
     Noise counts as white if the correlation of neighbours is within three standard errors of zero.
     """
-    noise, is_white = as_if_white(residuals, used, unknowns)
+    noise, is_white = white_noise_model(residuals, used, unknowns)
     if is_white:
         return noise
-    lags = faded(autocovariance(np.where(used, residuals, 0.0), used, REACH_PX))
+    lags = taper(autocovariance(np.where(used, residuals, 0.0), used, REACH_PX))
     return replace(noise, autocovariance_dn2=lags * (noise.variance_dn2 / lags[REACH_PX, REACH_PX]))
 
 
@@ -119,9 +119,9 @@ def influence_covariances(
 def _coloured_covariances(influences: NDArray[Real], kept: NDArray[Any], used: Mask, variances: Array) -> Array:
     """Covariances (n, k, k) as of `influence_covariances`, with the autocovariance of the residuals kept."""
     index = np.arange(-REACH_PX, REACH_PX + 1)
-    lags = faded(autocovariance(kept, used, REACH_PX))
+    lags = taper(autocovariance(kept, used, REACH_PX))
     lags *= (variances / np.maximum(lags[:, REACH_PX, REACH_PX], 1e-300))[:, None, None]
-    size: list[int] = padded(tuple(kept.shape[1:]), REACH_PX)
+    size: list[int] = transform_size(tuple(kept.shape[1:]), REACH_PX)
     kernels = np.zeros((len(kept), *size), np.float32)
     kernels[:, index[:, None], index] = lags
     weights = np.full(size[1] // 2 + 1, 2.0)  # columns of a real transform also stand for their conjugates
@@ -134,14 +134,14 @@ def _coloured_covariances(influences: NDArray[Real], kept: NDArray[Any], used: M
     return np.asarray(real + imaginary, float)
 
 
-def faded(lags: Array) -> Array:
+def taper(lags: Array) -> Array:
     """Taper the far lags of autocovariances (..., lags, lags), which are dominated by noise."""
     reach = lags.shape[-1] // 2
     index = np.arange(-reach, reach + 1)
     return np.asarray(lags * np.clip(reach + 1 - np.hypot(index[:, None], index), 0.0, 1.0))
 
 
-def as_if_white(
+def white_noise_model(
     residuals: Array, used: Mask, unknowns: int, information: float | None = None
 ) -> tuple[NoiseModel, bool]:
     """White-noise model, and whether the residuals are white. information: equivalent number of ordinary pixels, where
@@ -154,8 +154,8 @@ def as_if_white(
 
 
 def is_textured(residuals: Array, used: Mask, floor_dn: float) -> bool:
-    """Whether residuals show a landscape rather than grain: still correlated beyond the reach of grain. floor_dn: model
-    error, which does not count."""
+    """Whether residuals show image texture rather than grain: they are correlated beyond the reach of grain. floor_dn:
+    model error, which does not count."""
     kept = np.where(used, residuals, 0.0)
     if not kept.any():
         return False
@@ -167,7 +167,7 @@ def may_be_noise(off: Array, covariance: Array) -> bool:
     return bool(off @ np.linalg.solve(covariance, off) < _ODDS)
 
 
-def correlated(columns: Array, noise: NoiseModel, power: float = 1.0) -> Array:
+def correlate(columns: Array, noise: NoiseModel, power: float = 1.0) -> Array:
     """Product of the noise's covariance matrix and images (n, height, width), by FFT in single precision; powers other
     than 1 ignore the image border."""
     spectrum, shape = _spectrum(noise, columns.shape[1:])
@@ -179,7 +179,7 @@ def correlated(columns: Array, noise: NoiseModel, power: float = 1.0) -> Array:
 def _spectrum(noise: NoiseModel, size: tuple[int, ...]) -> tuple[Array, list[int]]:
     """Power spectrum of the noise for images of a size, and the size of the transform."""
     reach = len(noise.autocovariance_dn2) // 2
-    shape, index = padded(size, reach), np.arange(-reach, reach + 1)
+    shape, index = transform_size(size, reach), np.arange(-reach, reach + 1)
     kernel = np.zeros(shape)
     kernel[np.ix_(index, index)] = noise.autocovariance_dn2
     return np.asarray(fft.rfft2(kernel).real), shape
@@ -195,27 +195,27 @@ def _filtered(images: NDArray[Real], spectrum: NDArray[Real], shape: list[int]) 
 def autocovariance(kept: Array, used: Mask, reach: int) -> Array:
     """(..., lags, lags) autocovariance of images (..., height, width) up to reach, averaged over mirrored lags, since
     grain is isotropic."""
-    shape = padded(kept.shape[-2:], reach)
+    shape = transform_size(kept.shape[-2:], reach)
     spectra = np.abs(fft.rfft2(np.stack([kept, used]), s=shape)) ** 2
-    products, pairs = fft.irfft2(spectra, s=shape)
+    sums, pairs = fft.irfft2(spectra, s=shape)
     index = np.arange(-reach, reach + 1)
-    lags = (products / np.maximum(pairs, 1.0))[..., index[:, None], index]
+    lags = (sums / np.maximum(pairs, 1.0))[..., index[:, None], index]
     lags = (lags + lags[..., ::-1]) / 2
     return np.asarray((lags + lags.swapaxes(-1, -2)) / 2)
 
 
-def padded(shape: tuple[int, ...], reach: int) -> list[int]:
+def transform_size(shape: tuple[int, ...], reach: int) -> list[int]:
     """Transform size that avoids wrap-around up to the reach."""
     return [fft.next_fast_len(size + reach, real=True) for size in shape]
 
 
 def covariance_along(kept: Array, used: Mask, lag: int) -> Array:
     """(...) mean product of images (..., height, width) at a lag along rows and columns."""
-    products = kept[..., lag:] * kept[..., :-lag], kept[..., lag:, :] * kept[..., :-lag, :]
+    neighbours = kept[..., lag:] * kept[..., :-lag], kept[..., lag:, :] * kept[..., :-lag, :]
     pairs = used[..., lag:] & used[..., :-lag], used[..., lag:, :] & used[..., :-lag, :]
     sums = [
         each.sum(axis=(-2, -1)) / np.maximum(both.sum(axis=(-2, -1)), 1)
-        for each, both in zip(products, pairs, strict=True)
+        for each, both in zip(neighbours, pairs, strict=True)
     ]
     return np.asarray(sum(sums) / 2)
 
@@ -259,7 +259,7 @@ def steadiness(residuals: Array, light: Array, ground: Mask, used: Mask) -> Arra
     return np.asarray(np.exp(-np.clip(power, 0.0, _MOST) * change))
 
 
-def weighted(design: Array, used: Mask, noise: NoiseModel, contrast_dn: float) -> tuple[Array, Array]:
+def gls_weights(design: Array, used: Mask, noise: NoiseModel, contrast_dn: float) -> tuple[Array, Array]:
     """Weighted derivatives B and C B', each (unknowns, height, width) and 0 where not used; C: covariance of the
     noise."""
     scale_dn2, (spectrum_dn2, shape) = noise.variance_dn2, _spectrum(noise, used.shape)

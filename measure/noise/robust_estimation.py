@@ -143,17 +143,17 @@ def damage(residuals: Array, area: Mask, sigmas: float, floor_dn: float, is_loss
     smooth = np.where(area, smooth, 0.0)
     limit = sigmas * max(robust_scale(smooth[area]), floor_dn)
     if is_lossy:
-        return grown(_opened(np.abs(smooth) > limit))
+        return dilate_mask(_open_mask(np.abs(smooth) > limit))
     # Much dust inflates even the robust scale and hides fainter specks: estimate it again without the obvious ones.
     limit = sigmas * max(robust_scale(smooth[area & (np.abs(smooth) <= limit)]), floor_dn)
     large = np.abs(smooth) > limit
     count, regions = cv2.connectedComponents(large.astype(np.uint8), connectivity=4)
     is_damage = np.zeros(count, dtype=bool)
-    is_damage[regions[_opened(large)]] = True
+    is_damage[regions[_open_mask(large)]] = True
     return np.asarray(is_damage[regions])
 
 
-def _opened(mask: Mask) -> Mask:
+def _open_mask(mask: Mask) -> Mask:
     """Morphological opening: keep what is wider than a pixel."""
     # An even structuring element is off-centre: the anchors of erosion and dilation must be opposite.
     speck = np.ones((2, 2), np.uint8)
@@ -161,7 +161,7 @@ def _opened(mask: Mask) -> Mask:
     return np.asarray(cv2.dilate(eroded, speck, anchor=(1, 1)) > 0)
 
 
-def grown(mask: Mask) -> Mask:
+def dilate_mask(mask: Mask) -> Mask:
     """Dilate a mask by the pixels that touch it along an edge."""
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     return np.asarray(cv2.dilate(mask.astype(np.uint8), cross) > 0)

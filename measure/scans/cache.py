@@ -51,7 +51,7 @@ class Segments(ABC):
     channels: int
     full_scale_dn: float
     sample_bytes: int
-    rounding_step_dn: float
+    quantisation_step_dn: float
     first_block_px: tuple[int, int] = (0, 0)
     origin_px: tuple[int, int] = (0, 0)
 
@@ -161,10 +161,10 @@ class WholePicture(Segments):
     a part of a sentence; empty if it can."""
 
     def __init__(
-        self, samples: Samples, rounding_step_dn: float = 0.0, damage: str = "", full_scale_dn: float | None = None
+        self, samples: Samples, quantisation_step_dn: float = 0.0, damage: str = "", full_scale_dn: float | None = None
     ) -> None:
         """full_scale_dn: None if all bits of a sample are used."""
-        self._samples, self._damage, self.rounding_step_dn = samples, damage, rounding_step_dn
+        self._samples, self._damage, self.quantisation_step_dn = samples, damage, quantisation_step_dn
         self.height_px, self.width_px, self.channels = samples.shape
         self.segment_height_px, self.segment_width_px = self.height_px, self.width_px
         self.sample_bytes = samples.itemsize

@@ -204,7 +204,7 @@ def _header_bytes(data: bytes) -> int:
     return 2 + sum(4 + len(body) for _, body in jpeg_headers(data))
 
 
-def rounding_step_dn(data: bytes) -> float:
+def quantisation_step_dn(data: bytes) -> float:
     """Mean quantisation step of the luminance's coarser detail, in grey values. data: a JPEG file, or its beginning up
     to the picture's data."""
     for marker, body in jpeg_headers(data):
@@ -239,7 +239,7 @@ def open_jpeg(path: Path, max_pixels: int | None) -> OpenedPicture:
         if not form.width_px * form.height_px:
             raise damage_error(path, str(error)) from error
         samples, damage = np.zeros((form.height_px, form.width_px, 1), np.uint8), str(error)
-    picture = WholePicture(samples, rounding_step_dn(data), damage, 2.0**form.bits - 1)
+    picture = WholePicture(samples, quantisation_step_dn(data), damage, 2.0**form.bits - 1)
     exif = _exif_page(data)
     orientation = 1 if exif is None else orientation_tag(exif)
     return OpenedPicture(picture, jpeg_pitch(data), orientation_notes(orientation), orientation=orientation)
@@ -359,13 +359,15 @@ def _combs(coefficients: Array) -> Array:
     return clearness.reshape(places, kinds, -1)
 
 
-def covariance_of_compression(rounding_step_dn: float, contrast_dn: float) -> Array:
+def covariance_of_compression(quantisation_step_dn: float, contrast_dn: float) -> Array:
     """(2, 2) px², part of a mark's covariance by lossy compression. contrast_dn: in grey values of the file."""
-    lost = min(_LOST_PX * (rounding_step_dn / max(abs(contrast_dn), 1e-9)) ** 2, _MOST_LOST_PX)
+    lost = min(_LOST_PX * (quantisation_step_dn / max(abs(contrast_dn), 1e-9)) ** 2, _MOST_LOST_PX)
     return np.asarray(lost**2 * np.eye(2))
 
 
-def covariances_of_rounding(influences: Single, pictures: Single, origins_px: Array, rounding_step_dn: float) -> Array:
+def covariances_of_rounding(
+    influences: Single, pictures: Single, origins_px: Array, quantisation_step_dn: float
+) -> Array:
     """Covariances of linear estimates by the rounding of cosine coefficients.
 
     At edges that are sharp relative to the steps, rounding errors resemble shifts of the edges, so that residuals do
@@ -390,13 +392,13 @@ def covariances_of_rounding(influences: Single, pictures: Single, origins_px: Ar
         own[:, row : row + height, col : col + width] = image
     by_block = padded.reshape(number, kinds, blocks, BLOCK_PX, blocks, BLOCK_PX)
     *along, pictured = np.moveaxis(dctn(by_block, axes=(3, 5), norm="ortho"), 1, 0)
-    errors = np.minimum(np.abs(pictured), rounding_step_dn / np.sqrt(12))
+    errors = np.minimum(np.abs(pictured), quantisation_step_dn / np.sqrt(12))
     shifts = np.stack(along, axis=1) * errors[:, None]
     flat = shifts.reshape(number, 2, -1)
     return np.asarray(flat @ flat.swapaxes(1, 2), float)
 
 
-def tone_variance(rounding_step_dn: float, contrast_dn: float) -> float:
+def tone_variance(quantisation_step_dn: float, contrast_dn: float) -> float:
     """Variance of each departure of the tone curve, in units of its prior variance, by lossy compression; common to all
     marks of a scanner. contrast_dn: of the mark, in grey values of the file."""
-    return (_TONE_LOST * rounding_step_dn / max(abs(contrast_dn), 1e-9)) ** 2
+    return (_TONE_LOST * quantisation_step_dn / max(abs(contrast_dn), 1e-9)) ** 2

@@ -77,7 +77,7 @@ def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
     segments = opened.segments
     is_one = segments.segment_height_px >= segments.height_px and segments.segment_width_px >= segments.width_px
     if isinstance(path, Address) and is_one:
-        whole = "the file has its picture in one piece, and was fetched whole: of tiles, most would not be"
+        whole = "the file has its picture in one piece, and was fetched whole: of a tiled file only a part is fetched"
         opened = replace(opened, notes=(*opened.notes, whole))
     return Scan(path, segments, opened.pitch, opened)
 
@@ -216,7 +216,7 @@ class WindowSegments(Segments):
         self.channels = scan.channels
         self.full_scale_dn = scan.full_scale_dn
         self.sample_bytes = scan.samples_dtype().itemsize
-        self.rounding_step_dn = scan.rounding_step_dn
+        self.quantisation_step_dn = scan.quantisation_step_dn
         (col, row), (first_col, first_row) = scan.origin_px, scan.first_block_px
         self.origin_px = col + self._col0, row + self._row0
         self.first_block_px = (first_col - self._col0) % BLOCK_PX, (first_row - self._row0) % BLOCK_PX
@@ -260,5 +260,5 @@ def thumbnail(scan: Scan, largest_px: int) -> Scan:
     same = size == grey.shape[::-1]
     samples = grey if same else np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint16)
     pitch = Pitch(None if scan.pitch_um is None else (shrunk * scan.pitch_um[0], shrunk * scan.pitch_um[1]))
-    picture = WholePicture(samples[:, :, None], scan.rounding_step_dn * unit / shrunk)
+    picture = WholePicture(samples[:, :, None], scan.quantisation_step_dn * unit / shrunk)
     return Scan(scan.path, picture, pitch)

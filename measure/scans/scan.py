@@ -29,7 +29,7 @@ _PART_PX = 512  # approximate side of the part that a thread reduces at a time, 
 _LARGEST_PART_PX = 2048  # largest side of a part in whole segments; larger segments are divided
 _COMPRESSION_PX = 256  # side of the central part tested for an earlier compression: 1000 blocks
 _PLAINLY_COARSER = 1.5  # least ratio to the file's own rounding step, which shows as well
-_OF_A_PX = 0.01  # tolerance of an overview's size, px, where its last pixel covers only a part
+_SIZE_TOLERANCE_PX = 0.01  # tolerance of an overview's size, px, where its last pixel covers only a part
 _COUNTED_PX, _COUNTED_SIDE = 64, 4  # side of the windows in which values are counted, and their number a side
 _NAMED = 3  # damaged parts listed by name; more are counted
 _LEAST_UNIT_DN = 16  # least step of grey values of 8 bits stored in 16: 12 bits in the high bits have this step
@@ -78,9 +78,9 @@ class Scan:
         self.weights: Sequence[float] = (1.0,) if self.channels == 1 else LUMINANCE
 
     @cached_property
-    def rounding_step_dn(self) -> float:
+    def quantisation_step_dn(self) -> float:
         """Quantisation step of coarse detail by lossy compression, of the file or an earlier one; 0 without any."""
-        return max(self._segments.rounding_step_dn, self._earlier[0])
+        return max(self._segments.quantisation_step_dn, self._earlier[0])
 
     @property
     def first_block_px(self) -> tuple[int, int]:
@@ -89,7 +89,7 @@ class Scan:
 
     @property
     def is_lossy(self) -> bool:
-        return self.rounding_step_dn > 0
+        return self.quantisation_step_dn > 0
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -171,7 +171,7 @@ class Scan:
             return weighted(light, self._weights(weights))
         reach = self.tone.sharpening.reach_px
         wide = self.samples(col0 - reach, row0 - reach, width + 2 * reach, height + 2 * reach)
-        codes = self.tone.sharpening.undone(np.moveaxis(wide, -1, 0).astype(np.float32))
+        codes = self.tone.sharpening.unsharpen(np.moveaxis(wide, -1, 0).astype(np.float32))
         codes = np.moveaxis(codes[:, reach : reach + height, reach : reach + width], 0, -1)
         light = self.tone.light(np.clip(codes, 0.0, self.full_scale_dn), self.full_scale_dn)
         return weighted(light, self._weights(weights))
@@ -234,7 +234,7 @@ class Scan:
         places = "; ".join(f"rows {first} to {first + part.height - 1}, {part.why}" for first, part in named)
         more = f"; and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
         what = (
-            f"nothing of it can be trusted ({lost[0].why})"
+            f"none of it can be trusted ({lost[0].why})"
             if self.is_lost
             else f"parts cannot be trusted ({places}{more})"
         )
@@ -304,7 +304,7 @@ class Scan:
             return none
         luminance = weighted(samples, LUMINANCE if self.channels > 1 else (1.0,))
         step_dn, (col, row) = earlier_compression(luminance / np.float32(unit))
-        is_coarser = unit * step_dn > _PLAINLY_COARSER * self._segments.rounding_step_dn
+        is_coarser = unit * step_dn > _PLAINLY_COARSER * self._segments.quantisation_step_dn
         return (unit * step_dn, ((col0 + col) % BLOCK_PX, (row0 + row) % BLOCK_PX)) if is_coarser else none
 
     def _reduced_channels(self, factor: int, width: int, height: int) -> Single:
@@ -347,7 +347,7 @@ class Scan:
         """Resampling from this overview to its scan reduced by a factor: integer factor of averaging, then step (x, y)
         and position (x, y) of the first pixel for the interpolation."""
         px = np.array([scan.width_px / self.width_px, scan.height_px / self.height_px])  # of the scan to one of these
-        whole = max(int(factor / px.max() + _OF_A_PX), 1)
+        whole = max(int(factor / px.max() + _SIZE_TOLERANCE_PX), 1)
         scale = factor / (whole * px)
         return whole, scale, scale / 2 - 0.5
 

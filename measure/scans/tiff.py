@@ -25,7 +25,7 @@ from tifffile.tifffile import jpeg_decode_colorspace
 
 from measure.errors import MeasurementError
 from measure.scans.cache import LostPart, OpenedPicture, Place, Segments
-from measure.scans.jpeg import decode_checked, rounding_step_dn
+from measure.scans.jpeg import decode_checked, quantisation_step_dn
 from measure.scans.metadata import (
     DECODING_ERRORS,
     JPEG_COMPRESSIONS,
@@ -59,7 +59,7 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())  # our own messa
 
 TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the first bytes of TIFF and BigTIFF files
 _UNCOMPRESSED = 1  # of Compression (TIFF 6.0)
-_LOOKED_AT_BYTES = 1 << 16  # checked after the last extent of a file
+_TRAILING_BYTES = 1 << 16  # checked after the last extent of a file
 _JPEG_HEADERS_BYTES = 4096  # tables, size and resolution need fewer
 _REDUCED_IMAGE, _NOT_WHOLE = 1, 1 | 4  # bits of NewSubfileType: reduced, and reduced or a transparency mask
 _ALPHA = (1, 2)  # of ExtraSamples: associated and unassociated transparency
@@ -323,7 +323,7 @@ def _check_extent(page: TiffPage, path: Path, taken: list[Extent]) -> None:
     with path.open("rb") as file:
         last = max(end for _, end in taken)
         file.seek(last)
-        if any(file.read(_LOOKED_AT_BYTES)):
+        if any(file.read(_TRAILING_BYTES)):
             raise damage_error(
                 path, f"its last {size - last} bytes are not part of any page: bytes may have been inserted before"
             )
@@ -339,7 +339,7 @@ def _page_rounding_step_dn(file: TiffFile, page: TiffPage) -> float:
         first = next(index for index, count in enumerate(page.databytecounts) if count)
         file.filehandle.seek(page.dataoffsets[first])
         start = file.filehandle.read(min(page.databytecounts[first], _JPEG_HEADERS_BYTES))
-    return rounding_step_dn(start)
+    return quantisation_step_dn(start)
 
 
 def tiff_colour_tags(path: Path) -> ColourTags:
@@ -358,12 +358,12 @@ class TiffSegments(Segments):
     """The tiles or strips of a TIFF page."""
 
     def __init__(
-        self, file: TiffFile, page: TiffPage, path: Path, radiometry: Radiometry, rounding_step_dn: float
+        self, file: TiffFile, page: TiffPage, path: Path, radiometry: Radiometry, quantisation_step_dn: float
     ) -> None:
         self._file, self._page, self._path, self._radiometry = file, page, path, radiometry
         self._reading = Lock()
         self._address = path if isinstance(path, Address) else None
-        self.rounding_step_dn = rounding_step_dn
+        self.quantisation_step_dn = quantisation_step_dn
         self.channels, self.full_scale_dn = radiometry.channels, radiometry.full_scale_dn
         self.sample_bytes = radiometry.sample_bytes
         self.height_px, self.width_px = page.imagelength, page.imagewidth
@@ -450,7 +450,7 @@ class TiffSegments(Segments):
         """Floating-point numbers that map to 0 and full scale: the smallest usual scale that holds all finite numbers
         of the picture, else the extremes. Undecodable parts are ignored."""
         extremes = list[float]()
-        page = TiffSegments(self._file, self._page, self._path, self._radiometry, self.rounding_step_dn)
+        page = TiffSegments(self._file, self._page, self._path, self._radiometry, self.quantisation_step_dn)
         page._reading = self._reading  # threads of both move the position in one file
         rows, columns = page._grid
         for row, column in product(range(rows), range(columns)):
@@ -552,9 +552,9 @@ class RawRows(TiffSegments):
     """Uncompressed file with its rows in order: any part is read directly, regardless of strips, and not cached."""
 
     def __init__(
-        self, file: TiffFile, page: TiffPage, path: Path, radiometry: Radiometry, rounding_step_dn: float
+        self, file: TiffFile, page: TiffPage, path: Path, radiometry: Radiometry, quantisation_step_dn: float
     ) -> None:
-        super().__init__(file, page, path, radiometry, rounding_step_dn)
+        super().__init__(file, page, path, radiometry, quantisation_step_dn)
         self.segment_height_px, self.segment_width_px = 1, self.width_px
 
     def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from measure.array_types import Array, Single
 from measure.geometry import linear_scale, scan_px
-from measure.matching.window import Sides, clipped_sides
+from measure.matching.window import ClippedEnds, clipped_ends
 from measure.scans.metadata import Samples
 from measure.scans.parallel import map_in_threads
 from measure.scans.scan import Scan, means, weighted
@@ -57,13 +57,13 @@ class ScanBlock:
         at = self._index(corners, col, row)
         return weighted(pixels.take(at, axis=0, mode="clip"), self.scan.weights)
 
-    def clipped_sides(self, corners: NDArray[np.intp], col: NDArray[np.intp], row: NDArray[np.intp]) -> Sides:
+    def clipped_ends(self, corners: NDArray[np.intp], col: NDArray[np.intp], row: NDArray[np.intp]) -> ClippedEnds:
         """(n, count) ends of the scanner's range at which the grey values of these pixels are clipped."""
         return self._sides.take(self._index(corners, col, row), mode="clip")
 
     @cached_property
-    def _sides(self) -> Sides:
-        return clipped_sides(self.samples, self.scan.full_scale_dn)
+    def _sides(self) -> ClippedEnds:
+        return clipped_ends(self.samples, self.scan.full_scale_dn)
 
     def _index(self, corners: NDArray[np.intp], col: NDArray[np.intp], row: NDArray[np.intp]) -> NDArray[np.intp]:
         width, _ = self.size_px

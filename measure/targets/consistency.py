@@ -63,13 +63,13 @@ class TargetComparison:
     Attributes
     ----------
     off_px : (n, 2) observed minus predicted.
-    chance : (n,) p-value of that deviation.
+    p_values : (n,) of that deviation.
     covariance_px2 : (n, 2, 2) of off_px for exact object coordinates.
     printed_off_px : (n, 2) observed minus the place of the given coordinates, moved off the sheet only.
     """
 
     off_px: Array
-    chance: Array
+    p_values: Array
     covariance_px2: Array
     printed_off_px: Array
 
@@ -186,13 +186,13 @@ def _p_values(fit: _Regression, targets: TargetPlaces) -> Array:
         return np.ones(len(fit.squares))
     near = np.asarray(cKDTree(targets.places_px).query(targets.places_px, k=np.arange(2, count + 1))[1])
     local = np.median(fit.squares[near], axis=1) / _MEDIAN
-    chance = np.ones(len(fit.squares))
+    p_values = np.ones(len(fit.squares))
     for group in (targets.is_free, ~targets.is_free):
         share = group.sum() / len(group)
         freedom = MEDIAN_EFFICIENCY * share * (2.0 * len(group) - fit.unknowns)
         if freedom > 1.0:
-            chance[group] = fdtrc(2, freedom, fit.squares[group] / np.maximum(local[group], 1.0) / 2.0)
-    return chance
+            p_values[group] = fdtrc(2, freedom, fit.squares[group] / np.maximum(local[group], 1.0) / 2.0)
+    return p_values
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,11 +95,11 @@ def place_disks(block: ScanBlock, patches: Patches, margins_px: Array) -> list[M
 
 def _groups(patches: Patches, strides: Indices, margins_px: Array) -> Iterator[Indices]:
     """Indices of patches with windows of similar size, in groups of limited pixel count."""
-    sides = 2 * _half_sides(patches, strides, margins_px) + 1
-    rest = np.argsort(-sides, kind="stable")
+    ends = 2 * _half_sides(patches, strides, margins_px) + 1
+    rest = np.argsort(-ends, kind="stable")
     while len(rest):
-        own = rest[: max(_GROUP_PIXELS // int(sides[rest[0]]) ** 2, 1)]
-        own = own[2 * sides[own] >= sides[rest[0]]]
+        own = rest[: max(_GROUP_PIXELS // int(ends[rest[0]]) ** 2, 1)]
+        own = own[2 * ends[own] >= ends[rest[0]]]
         yield own
         rest = rest[len(own) :]
 
@@ -132,7 +132,7 @@ class _DiskFit:
         col, row = np.tile(along, self.side), np.repeat(along, self.side, axis=1)
         inside = block.holds(corners[..., None] + along[:, None])
         self.grey = block.grey_values(corners, col, row)
-        self.sides = block.clipped_sides(corners, col, row) if is_censored else np.int8(0)
+        self.ends = block.clipped_ends(corners, col, row) if is_censored else np.int8(0)
         self.col, self.row = (np.asarray(one - half * stride, np.float32) for one in (col, row))
         self.middles, self.radius = middles, patches.radii
         self.centers, self.shapes = patches.centers - middles, patches.shapes
@@ -150,18 +150,18 @@ class _DiskFit:
         self.residuals = self.grey - (self.greys[:, None].astype(np.float32) @ self.design[:, 6:])[:, 0]
         self.design[:, :6] *= self.greys[:, :1, None].astype(np.float32)
         # A clipped grey value says nothing where the model lies beyond the end of the range as well.
-        self.telling = self.used & (self.sides * self.residuals >= 0)
-        middle, count = self.telling.shape[1] // 2, self.telling.sum(axis=1)
+        self.informative = self.used & (self.ends * self.residuals >= 0)
+        middle, count = self.informative.shape[1] // 2, self.informative.sum(axis=1)
         # Other pixels are put below and above all of these in equal numbers, so that the median stays the median.
-        beyond = np.where(np.cumsum(~self.telling, axis=1) % 2, np.float32(np.inf), np.float32(-1))
-        off = np.where(self.telling, np.abs(self.residuals), beyond)
+        beyond = np.where(np.cumsum(~self.informative, axis=1) % 2, np.float32(np.inf), np.float32(-1))
+        off = np.where(self.informative, np.abs(self.residuals), beyond)
         off.partition(middle, axis=1)
         unbiased = np.sqrt(count / np.maximum(count - _UNKNOWNS, 1))
         self.scale = np.asarray(SIGMA_OF_DEVIATION * np.where(count > 0, off[:, middle], np.inf) * unbiased, float)
 
     def step(self, is_robust: bool) -> None:
         """Take one Gauss-Newton step; a robust one down-weights dust and neighbours."""
-        weights = self._weights() if is_robust else self.telling.astype(np.float32)
+        weights = self._weights() if is_robust else self.informative.astype(np.float32)
         change = gauss_newton_step(self.design, self.residuals, weights, _DAMPING)
         form = change[:, :5] / np.maximum(np.abs(change[:, :5]).max(axis=1, keepdims=True) / _LONGEST_STEP, 1.0)
         self.centers = self.centers + (self.shapes @ form[:, :2, None])[..., 0]
@@ -175,7 +175,7 @@ class _DiskFit:
     def _weights(self) -> Single:
         """(n, pixels), Tukey's."""
         scale = np.maximum(self.scale, _SCALE_FLOOR * np.abs(self.greys[:, 0]) + 1e-6)
-        return np.asarray(self.telling * tukey_weights(self.residuals / scale[:, None].astype(np.float32), 1.0))
+        return np.asarray(self.informative * tukey_weights(self.residuals / scale[:, None].astype(np.float32), 1.0))
 
     def placed(self, is_disk: Mask) -> Iterator[MarkFit]:
         """The disks in scan pixels, with covariances."""
@@ -189,7 +189,7 @@ class _DiskFit:
             influence.reshape(size), self.residuals.reshape(size)[:, 0], counted.reshape(size)[:, 0], _UNKNOWNS
         )
         blurs_px = np.sqrt(np.maximum(self.blur**2 - PIXEL_VARIANCE_PX2, 0.0))
-        damaged = 1 - weights.sum(axis=1) / np.maximum(self.telling.sum(axis=1), 1)
+        damaged = 1 - weights.sum(axis=1) / np.maximum(self.informative.sum(axis=1), 1)
         for number, (center_px, shape) in enumerate(zip(found.centers, found.shapes, strict=True)):
             yield MarkFit(
                 converged=bool(is_disk[number]),
@@ -205,7 +205,7 @@ class _DiskFit:
 
     def misfit(self) -> Array:
         """(n,) residual scale over its limit, which is lower where neighbouring residuals are correlated."""
-        left = (self.residuals * self.telling).reshape(-1, self.side, self.side)
+        left = (self.residuals * self.informative).reshape(-1, self.side, self.side)
         neighbours = (left[:, :, 1:] * left[:, :, :-1]).sum(axis=(1, 2))
         neighbours += (left[:, 1:] * left[:, :-1]).sum(axis=(1, 2))
         correlation = neighbours / np.maximum(2 * (left * left).sum(axis=(1, 2)), 1e-6)

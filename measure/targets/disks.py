@@ -93,7 +93,7 @@ class FittedDisk(MarkFit):
         return bool(self.is_fitted and self.blur_px > _MOST_BLUR * self.half_axes_px[1])
 
     @property
-    def is_spoilt(self) -> bool:
+    def is_mostly_damaged(self) -> bool:
         """Whether too few of the pixels around it fit a disk."""
         return bool(self.is_fitted and self.damaged_fraction > _MOST_DAMAGE)
 
@@ -163,7 +163,7 @@ def fit_disk(
 
     def fit_with_margin(margin_px: float) -> FittedDisk:
         fit = match(window, shape, start, replace(options, margin_px=margin_px))
-        return _assess(fit, covariance_of_compression(scan.rounding_step_dn, fit.stored_contrast_dn))
+        return _assess(fit, covariance_of_compression(scan.quantisation_step_dn, fit.stored_contrast_dn))
 
     disk = fit_with_margin(wide)
     soft = min(_MARGIN_BLURS * disk.blur_px, longest_margin_px)
@@ -176,7 +176,7 @@ def fit_disk(
     if not disk.reason or disk.is_soft or not sure < wide:
         return disk
     narrow = fit_with_margin(sure)
-    if narrow.reason or not disk.is_spoilt:
+    if narrow.reason or not disk.is_mostly_damaged:
         return narrow
     agree = may_be_noise(narrow.center_px - disk.center_px, narrow.covariance_px2 + disk.covariance_px2)
     return narrow if agree else replace(narrow, weakness=disk.reason.reword(f"with more ground: {disk.reason}"))
@@ -197,7 +197,7 @@ def fit_plain_disks(
     block = ScanBlock(scan, (int(col0), int(row0)), 0, scan.samples(int(col0), int(row0), int(width), int(height)))
     placed, disks = place_disks(block, patches, margins_px), []
     for fit, start, margin_px in zip(placed, candidates, longest_margins_px, strict=True):
-        disk = _assess(fit, covariance_of_compression(scan.rounding_step_dn, fit.contrast_dn))
+        disk = _assess(fit, covariance_of_compression(scan.quantisation_step_dn, fit.contrast_dn))
         stands_out = abs(disk.contrast_dn) > _PLAIN_SNR * disk.noise_dn
         if not stands_out or disk.reason or disk.weakness or disk.dust_reason:
             disk = fit_disk(scan, start.center_px, start.pixel_from_disk, margin_px)
@@ -222,9 +222,9 @@ def _assess(fit: MarkFit, compression_px2: Array) -> FittedDisk:
         message = f"no disk stands out: contrast {contrast:.0f}, noise {disk.noise_dn:.0f} grey values"
         reason = Reason(message, Code.CONTRAST)
     elif disk.noise_dn > worst * contrast and not fit.covariance_is_white:
-        message = f"no disk: what a disk leaves unexplained is {100 * disk.noise_dn / contrast:.0f} % of its contrast"
+        message = f"no disk: the residuals of a fitted disk are {100 * disk.noise_dn / contrast:.0f} % of its contrast"
         reason = Reason(message, Code.LIKENESS)
-    elif disk.is_spoilt:
+    elif disk.is_mostly_damaged:
         message = f"{100 * disk.damaged_fraction:.0f} % of the pixels about it do not fit a disk"
         reason = Reason(message, Code.COVERED)
     elif shorter < SMALLEST_RADIUS_PX:

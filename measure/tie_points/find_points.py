@@ -372,7 +372,7 @@ def _mark(name: str, point: TiePoint, frame: int, options: TieOptions) -> MarkMe
     if frame in point.refused:
         status, reason = Status.REJECTED, point.refused[frame]
     elif len(point.accepted_frames) < options.images:
-        message = f"only {len(point.accepted_frames)} scans agree on the point, {options.images} are to"
+        message = f"only {len(point.accepted_frames)} scans agree on the point, {options.images} have to"
         status, reason = Status.REJECTED, Reason(message, Code.FEW_SCANS)
     elif not point.is_sharp(frame):
         message = f"the texture fixes it to {point.error_px(frame):.2f} px only"

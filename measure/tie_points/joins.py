@@ -186,7 +186,7 @@ def _few_joins_problem(both: tuple[TieFrame, TieFrame], found: int, refused: Cou
     why = f", most of the others because {most[0][0]}" if most else ""
     return Reason(
         f"Only {found} of {found + refused.total()} places join {both[0].image} and {both[1].image}{why}. Scans that "
-        "overlap by more, of ground with texture, would have some tens; the standard deviations say what these are "
-        "worth.",
+        "overlap by more, of ground with texture, would have some tens; their standard deviations show how much "
+        "these determine.",
         Code.FEW_TIES,
     )

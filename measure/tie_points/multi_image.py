@@ -21,7 +21,7 @@ from scipy.special import chdtrc
 from measure.array_types import Array, Mask
 from measure.flags import NO_REASON, Code, Reason
 from measure.matching.gauss_newton import UNSETTLED, gauss_newton
-from measure.noise.noise_model import NoiseModel, correlated, noise_model
+from measure.noise.noise_model import NoiseModel, correlate, noise_model
 
 # Covariance, up to scale, of the coefficients of u², uv and v² of a surface with isotropic curvature.
 _ISOTROPIC = np.array([[0.75, 0.0, 0.25], [0.0, 1.0, 0.0], [0.25, 0.0, 0.75]])
@@ -296,7 +296,7 @@ class _JointMatch:
         explained = np.zeros((_UNKNOWNS, *self.used.shape))
         columns = [self.used[self.used], self.values.mean(axis=0)[self.used], *self.design[:, self.used]]
         explained[:, self.used] = np.linalg.qr(np.stack(columns, axis=1))[0].T
-        taken = float(np.sum(explained * correlated(explained, noise))) / max(noise.variance_dn2, 1e-300)
+        taken = float(np.sum(explained * correlate(explained, noise))) / max(noise.variance_dn2, 1e-300)
         pixels = int(self.used.sum())
         factor = (pixels - _UNKNOWNS) / max(pixels - taken, 0.5 * pixels)
         return NoiseModel(factor * noise.variance_dn2, factor * noise.autocovariance_dn2, noise.neighbour_correlation)
@@ -304,7 +304,7 @@ class _JointMatch:
     def _covariance(self, noise: NoiseModel) -> Array:
         """(6, 6) covariance of the affine parameters for correlated noise."""
         inverse = np.linalg.inv(self.normal)
-        spread = np.tensordot(correlated(self.design, noise), self.design, axes=([1, 2], [1, 2]))
+        spread = np.tensordot(correlate(self.design, noise), self.design, axes=([1, 2], [1, 2]))
         return np.asarray(inverse @ spread @ inverse)
 
     def _bendings(self, noises: Sequence[NoiseModel]) -> list[Bending | None]:
@@ -317,7 +317,7 @@ class _JointMatch:
         response = _products(bent, bent) - _products(single, bent).T @ through
         columns = np.zeros((bent.shape[2], *self.used.shape))
         columns[:, self.used] = (bent.mean(axis=0) - single.mean(axis=0) @ through).T
-        spreads = [np.tensordot(correlated(columns, each), columns, axes=([1, 2], [1, 2])) for each in noises]
+        spreads = [np.tensordot(correlate(columns, each), columns, axes=([1, 2], [1, 2])) for each in noises]
         bendings: list[Bending | None] = []
         for values, spread in zip(self.values, spreads, strict=True):
             observed = np.tensordot(columns, values - self.values[self.reference], axes=2)
@@ -339,7 +339,7 @@ class _JointMatch:
         moves = np.zeros_like(moves)
         moves[:, self.used] = free.T
         observed = np.einsum("kij,ij->k", moves, residuals)
-        spread = np.tensordot(correlated(moves, noise), moves, axes=([1, 2], [1, 2]))
+        spread = np.tensordot(correlate(moves, noise), moves, axes=([1, 2], [1, 2]))
         values, vectors = np.linalg.eigh(spread)
         real = values > 1e-9 * values[-1]
         return (

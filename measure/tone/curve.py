@@ -264,7 +264,7 @@ class Tone:
         """Convert light to grey values."""
         return np.asarray(full_scale * np.interp(np.asarray(light) / full_scale, self._table, _NODES))
 
-    def sharpened(self, sharpening: Sharpening) -> "Tone":
+    def replace_sharpening(self, sharpening: Sharpening) -> "Tone":
         """Copy of the curve, and of its prior, with the scan's sharpening."""
         before = self.before and replace(self.before, sharpening=sharpening)
         return replace(self, sharpening=sharpening, before=before)

@@ -10,7 +10,7 @@ from measure.tone.curve import Tone, ToneInformation
 
 _POWERS = 0.4, 3.0  # range of gamma; an estimate outside has a different cause
 _LINEAR = 0.3  # in standard deviations, shift of a mark for which its linearised fit serves
-_TELLING = 0.25  # trace of a mark's information, whose unit is that of the prior on one departure
+_INFORMATIVE = 0.25  # trace of a mark's information, whose unit is that of the prior on one departure
 _LONGEST = 1.0  # in standard deviations, largest change of a departure per iteration
 _SINGULAR = 1e-12  # relative eigenvalue of the normalised normal matrix below which it is numerical rounding
 
@@ -68,16 +68,16 @@ class FrameTone:
         step, sharpening = tone.mean - matched_by.mean, matched_by.sharpening
         if prior.is_known:
             return cls(prior, None, *ends, scatter, float(step @ step))
-        is_determined = float(np.median([np.trace(information.matrix) for information in each])) > _TELLING
+        is_determined = float(np.median([np.trace(information.matrix) for information in each])) > _INFORMATIVE
         value = tone.equivalent_power(*ends)[0]
         if not _POWERS[0] <= value <= _POWERS[1]:
             off = tone.mean - prior.mean
             source = f"{prior.source}; the marks say {value:.2f}, as no scanner does, which was not taken"
             covariance = prior.covariance + np.outer(off, off)
-            doubted = replace(prior, covariance=covariance, source=source, before=prior).sharpened(sharpening)
+            doubted = replace(prior, covariance=covariance, source=source, before=prior).replace_sharpening(sharpening)
             return cls(doubted, None, *ends, 0.0, float(off @ off), is_determined)
         information = replace(ToneInformation.pooled(each, scatter), sharpening=sharpening)
-        tone = replace(tone, before=prior).sharpened(sharpening)
+        tone = replace(tone, before=prior).replace_sharpening(sharpening)
         return cls(tone, information, *ends, scatter, float(step @ step), is_determined)
 
     @property

@@ -76,13 +76,13 @@ class Sharpening:
         terms = max(np.log(_TAIL) / np.log(share), 1.0) if share > 0 else 0.0
         return int(np.ceil(3.0 * self.radius_px * np.sqrt(terms)))
 
-    def undone(self, codes: NDArray[np.floating]) -> Array:
+    def unsharpen(self, codes: NDArray[np.floating]) -> Array:
         """Remove the sharpening of codes (..., height, width). The result is wrong within reach_px of a border."""
         smooth = _gaussian_spectrum(self.radius_px, codes.shape)
         return _filtered(codes, 1 / (1 + self.amount * (1 - smooth)))
 
     def changes(self, codes: NDArray[np.floating]) -> Array:
-        """(m, height, width) halos: minus the derivatives of the result of `undone`, codes (height, width), with
+        """(m, height, width) halos: minus the derivatives of the result of `unsharpen`, codes (height, width), with
         respect to m parameters. These are the amount and the logarithm of the radius or, without sharpening, the
         amounts for each of `RADII_PX`."""
         if not self:
@@ -98,7 +98,7 @@ class Sharpening:
         radius_px = float(np.clip(self.radius_px * np.exp(step[1]), *_RADIUS_RANGE_PX))
         return replace(self, amount=amount, radius_px=radius_px, covariance=covariance)
 
-    def accelerated(self, before: "Sharpening", last: "tuple[Sharpening, Sharpening] | None") -> "Sharpening":
+    def accelerate(self, before: "Sharpening", last: "tuple[Sharpening, Sharpening] | None") -> "Sharpening":
         """Next sharpening by Anderson's method from two iterations: of this estimate, found with the one before, and of
         the last two such. Amount and radius are correlated: full steps alternate."""
         if last is None or not (before and last[0]):
@@ -109,7 +109,7 @@ class Sharpening:
         share = float(bend @ (step / scale)) / max(float(bend @ bend), 1e-12)
         return before.apply_step(step - share * change, self.covariance)
 
-    def is_as(self, other: "Sharpening") -> bool:
+    def is_close_to(self, other: "Sharpening") -> bool:
         """Whether it differs from another one by little compared with its standard deviations."""
         step = np.array([self.amount - other.amount, np.log(self.radius_px / other.radius_px)])
         return bool(np.all(np.abs(step) < _CLOSE * np.sqrt(np.diag(self.covariance)) + _SAME))
@@ -122,7 +122,7 @@ class Sharpening:
         sigmas = np.sqrt(np.diag(self.covariance)) * (1.0, self.radius_px)
         return (
             f"The scan is sharpened, by an amount of {self.amount:.2f} (σ {sigmas[0]:.2f}) within "
-            f"{self.radius_px:.2f} px (σ {sigmas[1]:.2f}); marks were measured in what it was before."
+            f"{self.radius_px:.2f} px (σ {sigmas[1]:.2f}); marks were measured with the sharpening removed."
         )
 
 

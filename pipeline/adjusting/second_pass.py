@@ -9,7 +9,7 @@ import numpy as np
 
 from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.solution.result import Adjustment
-from measure.fiducials.scan_checks import without_lost
+from measure.fiducials.scan_checks import drop_lost_marks
 from measure.flags import Code, Reason, Status
 from measure.results import ON_FILM, MarkMeasurement
 from measure.scans.opening import open_scan
@@ -82,7 +82,7 @@ def search_again(search: RepeatedSearch) -> tuple[MarkMeasurement, ...] | str:
     try:
         with open_scan(scan_path(search.scan), search.max_pixels) as opened:
             grey = opened if search.settings.code is None else opened.green_channel()
-            marks = without_lost(opened, measure_single_targets(grey, search.sought, search.settings))
+            marks = drop_lost_marks(opened, measure_single_targets(grey, search.sought, search.settings))
     except Exception as error:
         return " ".join(str(error).split()) or type(error).__name__
     return tuple(mark for mark in marks if mark.status.is_observation)

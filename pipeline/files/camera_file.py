@@ -294,7 +294,7 @@ def _place_mark(
     if isinstance(mark, shapes.FrameCorner):
         reach = mark.reach_mm or max(min(abs(xy_mm[0]), abs(xy_mm[1])) * CORNER_REACH, 2 * mark.radius_mm)
         return shapes.frame_corner(xy_mm, reach, mark.radius_mm, mark.polarity)
-    return shapes.turned(mark, math.degrees(math.atan2(xy_mm[1], xy_mm[0]))) if radial else mark
+    return shapes.rotate_mark(mark, math.degrees(math.atan2(xy_mm[1], xy_mm[0]))) if radial else mark
 
 
 def _default_principal_point(fiducials: Sequence[GivenFiducial]) -> tuple[tuple[float, float] | None, float]:

@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 
 from adjust.functional_model.transformation import film_kind, fit_transformation
 from measure.annotations.text import networks, read_writing
-from measure.fiducials.camera_recognition import Answer, likeness, recognise_frame, search_camera
+from measure.fiducials.camera_recognition import CameraResponse, likeness, recognise_frame, search_camera
 from measure.fiducials.measure_frame import Frame
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.search import Hypotheses, PitchHypothesis, longer, pitch_hypotheses
@@ -74,7 +74,7 @@ class Tried:
     picture: Scan
     hypotheses: Hypotheses
     before: int
-    answer: Answer
+    answer: CameraResponse
 
 
 class LayoutSearch:

@@ -240,7 +240,7 @@ def check_sheet(project: Project, scans: Sequence[MeasuredScan]) -> tuple[Measur
     names, checked = list(sheet), {scan.frame.image: scan for scan in scans}
     for (name, image), one in zip(images.items(), compare_images(list(images.values()), places), strict=True):
         most_px = FLAT * float(np.hypot(*np.ptp(image.targets.places_px, axis=0)))
-        far_px, p_values = np.hypot(*one.off_px.T).tolist(), (shown.total() * one.chance).tolist()
+        far_px, p_values = np.hypot(*one.off_px.T).tolist(), (shown.total() * one.p_values).tolist()
         # Codes name their points whatever the coordinates are; a board's points are named by their places.
         printed_px = np.hypot(*one.printed_off_px.T) if named_by_place else np.zeros(len(far_px))
         verdicts = {

@@ -13,10 +13,10 @@ import numpy as np
 from measure.annotations.text import MISSING, networks
 from measure.errors import MeasurementError, MissingError, TooLargeError, UnreachableError
 from measure.fiducials.measurement import measure_fiducials
-from measure.fiducials.scan_checks import pitch_problem, second_frame, with_damage
+from measure.fiducials.scan_checks import pitch_problem, report_damage, second_frame
 from measure.flags import Code, Reason, Status
 from measure.marks.rendering import extent_px
-from measure.results import FrameMeasurement, MarkMeasurement, moved_frame
+from measure.results import FrameMeasurement, MarkMeasurement, shift_frame
 from measure.scans.opening import crop_scan
 from measure.scans.remote import TRAFFIC, ScanPart, public_text, scan_path
 from measure.scans.scan import Scan
@@ -123,7 +123,7 @@ def _open_and_measure(task: ScanTask, inspect: Inspection | None) -> MeasuredSca
             lens = None if fiducials.lens is None else fiducials.lens.crop(*window[:2])
             options = replace(options, fiducials=replace(fiducials, clicks=tuple(clicks), lens=lens))
             measured = _measure(task, cropped, options)
-            frame = moved_frame(measured.frame, first)  # in pixels of the whole scan
+            frame = shift_frame(measured.frame, first)  # in pixels of the whole scan
             measured = replace(measured, width_px=scan.width_px, height_px=scan.height_px, frame=frame)
         else:
             measured = _measure(task, scan, options)
@@ -159,7 +159,7 @@ def _measure(task: ScanTask, scan: Scan, options: ScanOptions) -> MeasuredScan:
     registered = scan.replace_weights(frame.weights) if frame.weights and frame.notes else scan
     if options.targets is not None:
         measured = measure_targets(options.targets, options.camera, options.exterior, registered, measured)
-    return replace(measured, frame=with_damage(scan, measured.frame))
+    return replace(measured, frame=report_damage(scan, measured.frame))
 
 
 def misplaced_principal_point(camera: CameraFile, measured: MeasuredScan) -> str:

@@ -240,7 +240,7 @@ def checked_places(
     targets = target_places(field.select([row[id] for id in observed]), model, scan)
     comparison = compare_targets(targets, places_px, covariances, (scan.width_px, scan.height_px))
     far = np.linalg.norm(comparison.off_px, axis=1)
-    verdicts = dict(zip(observed, zip(far.tolist(), comparison.chance.tolist(), strict=True), strict=True))
+    verdicts = dict(zip(observed, zip(far.tolist(), comparison.p_values.tolist(), strict=True), strict=True))
     checked = []
     for mark in marks:
         off_px, p_value = verdicts.get(mark.point, (0.0, 1.0))

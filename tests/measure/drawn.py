@@ -22,11 +22,11 @@ Array = NDArray[np.float64]
 STRIP = 10_000  # samples that are asked together
 
 
-def make_scan(grey: Array, full_scale: int = 65535, rounding_step_dn: float = 0.0) -> Scan:
+def make_scan(grey: Array, full_scale: int = 65535, quantisation_step_dn: float = 0.0) -> Scan:
     """Grey values (height, width), or those of channels, rounded and cut off, as a scan of 16 or 8 bits in memory."""
     rounded = np.clip(np.rint(grey if grey.ndim == 3 else grey[..., None]), 0, full_scale)
     stored: Samples = rounded.astype(np.uint16) if full_scale > 255 else rounded.astype(np.uint8)
-    return Scan(Path("drawn.tif"), WholePicture(stored, rounding_step_dn), NO_TAGS)
+    return Scan(Path("drawn.tif"), WholePicture(stored, quantisation_step_dn), NO_TAGS)
 
 
 def draw(inside: Callable[[Array, Array], Array], width: int, height: int, blur_px: float, fineness: int = 16) -> Array:

@@ -266,7 +266,7 @@ def test_a_part_that_may_be_another_is_refused(large_board: tuple[Array, dict[st
     """Of one corner's border with fewer squares than tell the longer side; and without an end of the longer side."""
     board = measure_board(draw.make_scan(large_board[0][shown]), LARGE)
     assert not any(mark.status.is_observation for mark in board.marks)
-    assert "nothing tells which part it is" in board.reason
+    assert "nothing shows which part it is" in board.reason
 
 
 @parametrize_with_studies("covered_mm", [28.0, 31.0, 34.0], quick=(1,))

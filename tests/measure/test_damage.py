@@ -14,7 +14,7 @@ from damaged_files import DAMAGES, measure_file, outcome, stored
 from numpy.typing import NDArray
 
 from measure import FrameMeasurement, MeasurementError, Status, open_scan
-from measure.fiducials.scan_checks import with_damage
+from measure.fiducials.scan_checks import report_damage
 from measure.noise.robust_estimation import damage
 
 CASES = 20  # of each damage in each kind of file, in the study
@@ -70,9 +70,9 @@ def test_thirty_bytes_lost_from_a_jpeg_stream(tmp_path: Path, kind: str) -> None
     data = stored()[kind]
     (tmp_path / "s.jpg").write_bytes(data[: len(data) // 2] + data[len(data) // 2 + 30 :])
     with open_scan(tmp_path / "s.jpg") as scan:
-        frame = with_damage(scan, measure_file(tmp_path / "s.jpg"))
+        frame = report_damage(scan, measure_file(tmp_path / "s.jpg"))
     assert {mark.status for mark in frame.marks} == {Status.ABSENT}
-    assert all("nothing of it can be trusted" in mark.reason for mark in frame.marks)
+    assert all("none of it can be trusted" in mark.reason for mark in frame.marks)
     assert "file is damaged" in frame.problems[0]
 
 

@@ -90,7 +90,7 @@ def test_a_sharp_mark_to_one_side_of_its_point_may_be_turned_otherwise_than_the_
         scan = make_scan(grey)
         found = detect_faint(scan, expected, 0.0, 0.3)
         assert found is not None
-        assert Cause.OWN_TURN in found.fit.place_covariance.parts
+        assert Cause.ROTATION in found.fit.place_covariance.parts
         errors.append(found.fit.center_px - place)
         sigmas.append(np.sqrt(np.diag(found.fit.covariance_px2)))
     errors_px, sigmas_px = np.array(errors), np.array(sigmas)

@@ -66,7 +66,7 @@ def middle(scan: Scan) -> tuple[Scan, NDArray[np.int64]]:
     """The part that shows the nine crosses in the middle and no others, and its first pixel, at a corner of blocks of
     the file's compression."""
     first = (np.array([scan.width_px, scan.height_px]) - MIDDLE_PX) // 16 * 8
-    part = WholePicture(scan.samples(int(first[0]), int(first[1]), MIDDLE_PX, MIDDLE_PX), scan.rounding_step_dn)
+    part = WholePicture(scan.samples(int(first[0]), int(first[1]), MIDDLE_PX, MIDDLE_PX), scan.quantisation_step_dn)
     return Scan(scan.path, part, NO_TAGS), first
 
 

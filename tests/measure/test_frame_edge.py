@@ -19,7 +19,7 @@ from measure.array_types import Single
 from measure.boards.corner_fit import Corner, CornerStart, Surface, crossing, fit_corners, quarter
 from measure.marks import shapes
 from measure.matching.frame_edge import fit_frame_corner
-from measure.scans.jpeg import rounding_step_dn
+from measure.scans.jpeg import quantisation_step_dn
 from measure.tone.curve import LINEAR, Tone, power
 
 Array = NDArray[np.float64]
@@ -44,7 +44,7 @@ class Measured(NamedTuple):
 def layout(vertices: tuple[shapes.Point, ...], at_mm: float) -> shapes.FiducialLayout:
     """One to each side, drawn as on the right."""
     turns = [float(np.degrees(np.arctan2(up, right))) for right, up in SIDES]
-    marks = [shapes.MarkShape((shapes.turned_part(shapes.Polygon(vertices), turn),)) for turn in turns]
+    marks = [shapes.MarkShape((shapes.rotate_part(shapes.Polygon(vertices), turn),)) for turn in turns]
     places = [(at_mm * x, at_mm * y) for x, y in SIDES]
     return lay_out(marks, places, (2 * HALF_MM, 2 * HALF_MM))
 
@@ -352,7 +352,7 @@ def square_picture(center: Array, steps: Array, blur_px: float, alone: bool) -> 
     return 50 + CORNER_CONTRAST * draw(light, CORNER_SIZE, CORNER_SIZE, blur_px)
 
 
-def fit_mark(window: Array, start: Array, steps: Array, alone: bool, rounding_step_dn: float = 0.0) -> Corner:
+def fit_mark(window: Array, start: Array, steps: Array, alone: bool, quantisation_step_dn: float = 0.0) -> Corner:
     outside = 4  # pixels that are none of the picture
     grey, valid = np.pad(window, outside), np.pad(np.ones(window.shape, bool), outside)
 
@@ -361,7 +361,7 @@ def fit_mark(window: Array, start: Array, steps: Array, alone: bool, rounding_st
         return ScanWindow(grey[part], (col, row), valid[part])
 
     starts = [CornerStart(start, steps, np.array([6.0, 6.0]), np.zeros(2))]
-    return fit_corners(read, starts, quarter if alone else crossing, rounding_step_dn, (0, 0))[0]
+    return fit_corners(read, starts, quarter if alone else crossing, quantisation_step_dn, (0, 0))[0]
 
 
 @parametrize_with_studies(("blur_px", "alone"), [(0.5, False), (0.9, False), (1.5, False), (0.8, True)], quick=(1,))
@@ -391,7 +391,7 @@ def test_what_jpeg_does_to_edges_is_in_the_standard_deviations(quality: int, alo
         noisy = np.rint(clean + rng.normal(0, 1.0, clean.shape)).astype(np.uint8)
         stored = cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
         grey = np.asarray(cv2.imdecode(stored, cv2.IMREAD_GRAYSCALE), float)
-        corner = fit_mark(grey, center, steps, alone, rounding_step_dn(stored.tobytes()))
+        corner = fit_mark(grey, center, steps, alone, quantisation_step_dn(stored.tobytes()))
         if not corner.reason:
             errors.append(whitened(corner.center_px - center, corner.covariance.px2))
     assert len(errors) >= 45

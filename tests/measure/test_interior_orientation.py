@@ -19,7 +19,7 @@ from measure.fiducials.interior_orientation import AFFINITY_SIGMA, FrameFit, fil
 from measure.fiducials.measure_frame import Frame, fit_lines_and_sharpening, measure_frame
 from measure.fiducials.measurement import _lacks_its_own, present_frame
 from measure.fiducials.scan_checks import pitch_problem
-from measure.fiducials.scan_orientation import SPOILT, MarkSite, PosedMark, decide_pose
+from measure.fiducials.scan_orientation import DISTURBANCE_P, MarkSite, OrientedMark, decide_scan_orientation
 from measure.fiducials.search import FrameSearch, PitchHypothesis, SearchResult
 from measure.fiducials.stages import Kind, Stage, StageResult, doubt_frame, find_frame
 from measure.flags import MAX_FALSE_FRAMES, NO_REASON, Code, Reason
@@ -375,7 +375,7 @@ def test_one_mark_and_the_places_of_the_others_tell_the_pose() -> None:
     layout = lay_out([MarkShape((*dot(0.2), *dots), "light") for dots in ids], CORNERS, (16.0, 16.0))
     scan = make_scan(picture(layout, "90"))
     frame = replace(make_frame_chance(scan, layout), inliers=np.array([True, False, False, False]))
-    pose = decide_pose(frame)
+    pose = decide_scan_orientation(frame)
     assert (pose.name, pose.decided) == ("90", True)
 
 
@@ -391,13 +391,13 @@ def test_one_scan_decides_its_pose(chips: bool, agreeing: int, decided: bool, mo
     ]
     sites = iter(range(4))
 
-    def best(_: MarkSite, shown: Sequence[PosedMark]) -> Array:
-        likelihoods = np.full(len(shown), np.log(SPOILT))
+    def best(_: MarkSite, shown: Sequence[OrientedMark]) -> Array:
+        likelihoods = np.full(len(shown), np.log(DISTURBANCE_P))
         likelihoods[1 if next(sites) < agreeing else 2] = 0.0
         return likelihoods
 
     monkeypatch.setattr(MarkSite, "likelihoods", best)
-    pose = decide_pose(replace(frame, layout=replace(DOTS, marks=tuple(with_chips))))
+    pose = decide_scan_orientation(replace(frame, layout=replace(DOTS, marks=tuple(with_chips))))
     assert pose.decided is decided, pose.evidence
     assert pose.name == POSES[1]
 
@@ -496,7 +496,7 @@ def test_a_lattice_named_one_step_off_lacks_the_line_that_it_alone_has(monkeypat
 
 def test_without_marks_that_tell_the_sharpening_stays_as_it_is_known() -> None:
     known = Sharpening(0.8, 1.2, 0.01 * np.eye(2))
-    scan = make_scan(np.zeros((400, 400))).replace_tone(Tone.unknown().sharpened(known))
+    scan = make_scan(np.zeros((400, 400))).replace_tone(Tone.unknown().replace_sharpening(known))
     placement = Placement("0", np.array([[1.0, 0.0, 200.0], [0.0, -1.0, 200.0]]), 1.0, 6, 1, 1, (1.0, 1.0))
     frame = Frame.from_placement(scan, FiducialLayout(tuple(MARKS), (220.0, 220.0)), placement, FiducialOptions())
     assert fit_lines_and_sharpening(frame) is frame
@@ -507,7 +507,7 @@ def test_a_sharpening_that_is_determined_is_not_estimated_again(
     sigma: float, times: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     known, estimated = Sharpening(0.8, 1.2, sigma**2 * np.eye(2)), list[Frame]()
-    scan = make_scan(np.zeros((400, 400))).replace_tone(Tone.unknown().sharpened(known))
+    scan = make_scan(np.zeros((400, 400))).replace_tone(Tone.unknown().replace_sharpening(known))
     placement = Placement("0", np.array([[1.0, 0.0, 200.0], [0.0, -1.0, 200.0]]), 1.0, 6, 1, 1, (1.0, 1.0))
     layout, options = FiducialLayout(tuple(MARKS), (220.0, 220.0)), FiducialOptions()
     frame, steps = Frame.from_placement(scan, layout, placement, options), "measure.fiducials.measure_frame"
@@ -534,7 +534,7 @@ def test_a_posed_placement_is_moved_by_what_the_coordinates_differ() -> None:
     """Marks opposite each other whose coordinates are not: shifted, turned and larger, as the names are changed."""
     camera_mm = np.array([(-109.0, 0.3), (109.4, 0.0), (0.0, 109.2), (0.2, -109.0)])
     placement = Placement("0", np.array([[16.0, 0.3, 2350.0], [0.3, -16.0, 2340.0]]), 1.0, 4, 1, 4, (0.0625, 0.0625))
-    turned = placement.posed("180", camera_mm)
+    turned = placement.reorient("180", camera_mm)
     opposite = [1, 0, 3, 2]
     before, after = placement.places_px(camera_mm), turned.places_px(camera_mm)[opposite]
     assert turned.names(before, camera_mm).tolist() == opposite

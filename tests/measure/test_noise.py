@@ -11,7 +11,7 @@ from measure import FiducialOptions, MarkFit, MatchOptions, match
 from measure.detection.localisation import MarkPrediction
 from measure.fiducials.mark_fit import detect_mark
 from measure.matching.covariance import second_order
-from measure.matching.window import clipped_sides, noise_scale, read_window
+from measure.matching.window import clipped_ends, noise_scale, read_window
 from measure.noise.grain import _KERNELS, GRAIN_PX, PATCH_PX, PLANE, grain_model
 from measure.noise.noise_model import influence_covariances, noise_model, steadiness
 from measure.tone.curve import Tone, power
@@ -208,11 +208,11 @@ def test_the_sigma_of_a_mark_on_ground_just_at_the_end_of_the_range_is_honest() 
 def test_ends_of_the_range_are_those_of_the_converter() -> None:
     grey = np.full((40, 40), 9000.0)
     grey[3, 4], grey[5, 6] = 4095 << 4, 0
-    sides = clipped_sides(make_scan(grey).samples(0, 0, 40, 40), 65535)
+    sides = clipped_ends(make_scan(grey).samples(0, 0, 40, 40), 65535)
     assert sides[3, 4] == 1
     assert sides[5, 6] == -1
     assert np.count_nonzero(sides) == 2
-    assert not clipped_sides(make_scan(grey).samples(10, 10, 20, 20), 65535).any()
+    assert not clipped_ends(make_scan(grey).samples(10, 10, 20, 20), 65535).any()
 
 
 def test_whites_cut_off_below_the_end_of_the_range_are_limits_too() -> None:
@@ -221,7 +221,7 @@ def test_whites_cut_off_below_the_end_of_the_range_are_limits_too() -> None:
         mark = some_mark(KIND["wing"], 1.0, rng)
         natural = 250 + 100 * (beyond - mark.picture + rng.standard_normal((mark.size, mark.size)) / 20)
         scan = make_scan(np.minimum(natural, 250), 255)
-        sides = clipped_sides(scan.samples(0, 0, mark.size, mark.size), 255)
+        sides = clipped_ends(scan.samples(0, 0, mark.size, mark.size), 255)
         np.testing.assert_array_equal(sides == 1, np.rint(natural) >= 250)
         start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + (0.7, -0.6)])
         fit = detect_mark(
@@ -230,4 +230,4 @@ def test_whites_cut_off_below_the_end_of_the_range_are_limits_too() -> None:
         assert chi_square(fit, mark.place[:, 2]) < 13.8
     for sigma in np.geomspace(0.2, 20, 40):
         grey = 128 + sigma * rng.standard_normal((60, 60)) - 40 * (np.arange(60) > 40)
-        assert not clipped_sides(make_scan(grey, 255).samples(0, 0, 60, 60), 255).any()
+        assert not clipped_ends(make_scan(grey, 255).samples(0, 0, 60, 60), 255).any()

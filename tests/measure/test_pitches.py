@@ -25,7 +25,7 @@ from measure.flags import Cause, Code, Reason
 from measure.geometry import POSES
 from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, ring_cross
 from measure.marks.templates import cut
-from measure.results import Covariance, MarkMeasurement, moved_frame
+from measure.results import Covariance, MarkMeasurement, shift_frame
 from measure.scans.metadata import Samples
 from measure.scans.opening import crop_scan
 from measure.tone.curve import LINEAR
@@ -303,7 +303,7 @@ def test_a_second_frame_is_named_with_the_windows_of_both(second: str | None, is
     scan = crop_scan(file, (13, 21, both.shape[1], both.shape[0]))  # the windows are those of the whole file
     window = (0, draw.FRAME_PX, draw.FRAME_PX, draw.FRAME_PX)
     frame = measure_fiducials(crop_scan(scan, window), draw.ALIKE, (draw.PITCH_UM, draw.PITCH_UM), options)
-    result = second_frame(scan, draw.ALIKE, moved_frame(frame, np.array([0.0, draw.FRAME_PX])), options)
+    result = second_frame(scan, draw.ALIKE, shift_frame(frame, np.array([0.0, draw.FRAME_PX])), options)
     assert bool(result) == is_named
     if is_named:
         windows = re.findall(r'"(\d+) (\d+) (\d+) (\d+)"', result)

@@ -19,13 +19,13 @@ from measure.boards.measure import measure_board
 from measure.boards.specs import ChessboardSpec
 from measure.flags import LIMITS, NO_REASON, Cause, Code, Reason, Status
 from measure.geometry import Affine
-from measure.marks.shapes import MarkShape, polygon, turned_part
+from measure.marks.shapes import MarkShape, polygon, rotate_part
 from measure.results import MEASURE_REVISION
 
 TABLE = Path(__file__).with_name("revision.json")
 PLACE_PX, SIGMA = 1e-4, 0.01  # which processors may make of rounding; SIGMA is a share
 WEDGE = polygon([(0.0, 0.0), (0.9, -0.5), (0.9, 0.5)])
-WEDGES = lay_out([MarkShape((turned_part(WEDGE[0], turn),)) for turn in (135.0, 45.0, -45.0, -135.0)])
+WEDGES = lay_out([MarkShape((rotate_part(WEDGE[0], turn),)) for turn in (135.0, 45.0, -45.0, -135.0)])
 
 Row = tuple[str, tuple[float, ...]]  # status; column, row and their standard deviations
 

@@ -18,7 +18,7 @@ from measure import FrameMeasurement, MatchOptions, ScanWindow, Status, match, m
 from measure.annotations.lines import KnownLine, Line, Reading, read_from_one_face
 from measure.fiducials.measure_frame import measure_frame, rename_frame
 from measure.fiducials.options import FiducialOptions, Reads
-from measure.fiducials.scan_orientation import Drawings, MarkSite, PosedMark, side_in_camera, writing_likelihoods
+from measure.fiducials.scan_orientation import Drawings, MarkSite, OrientedMark, side_in_camera, writing_likelihoods
 from measure.fiducials.search import FrameSearch, pitch_hypotheses
 from measure.geometry import POSES, pose_in_camera
 from measure.marks import shapes
@@ -189,7 +189,7 @@ def test_a_block_among_landscape_shows_which_way_it_is_turned() -> None:
         for index, linear in enumerate(turned):
             for shift_px in (0.0, 4.0):
                 site = among_landscape(template, linear, seed, shift_px)
-                result = site.likelihoods([PosedMark(template, FLIP @ each) for each in turned])
+                result = site.likelihoods([OrientedMark(template, FLIP @ each) for each in turned])
                 assert result.argmax() == index
                 assert np.sort(result)[-2] < -4.0
 
@@ -210,7 +210,7 @@ def among_landscape(template: shapes.MarkTemplate, linear: NDArray[np.float64], 
 HALF_WEDGE = shapes.MarkShape(shapes.polygon(((0.0, 0.0), (1.4, 0.0), (1.4, 0.8))))
 ANGLES = [float(np.degrees(np.arctan2(y, x))) for x, y in FRAME_CORNERS]
 LEANING = draw.lay_out(
-    [shapes.MarkShape(tuple(shapes.turned_part(part, angle) for part in HALF_WEDGE.parts)) for angle in ANGLES]
+    [shapes.MarkShape(tuple(shapes.rotate_part(part, angle) for part in HALF_WEDGE.parts)) for angle in ANGLES]
 )
 PITCH = (draw.PITCH_UM, draw.PITCH_UM)
 OPTIONS = FiducialOptions()
@@ -224,7 +224,7 @@ BLOCKS = shapes.FiducialLayout(
             str(k),
             place,
             (0.02, 0.02),
-            shapes.MarkShape(tuple(shapes.turned_part(part, 90.0 * k) for part in POSE_LEFT_OPEN_BLOCK.parts)),
+            shapes.MarkShape(tuple(shapes.rotate_part(part, 90.0 * k) for part in POSE_LEFT_OPEN_BLOCK.parts)),
         )
         for k, place in enumerate(UNEVEN)
     ),
@@ -237,7 +237,7 @@ def test_a_frame_viewed_as_its_mirror_image_is_renamed_as_it_lies() -> None:
     hypotheses = pitch_hypotheses(scan, LEANING, PITCH, OPTIONS)[0]
     found = FrameSearch(scan, LEANING, OPTIONS).search_scan(OPTIONS, hypotheses)
     right = next(each for each in found.placements if each.pose == "0")
-    mirrored = measure_frame(scan, LEANING, right.posed("0m", right_mm(LEANING)), OPTIONS)
+    mirrored = measure_frame(scan, LEANING, right.reorient("0m", right_mm(LEANING)), OPTIONS)
     assert int(mirrored.inliers.sum()) < 4
     frame = rename_frame(mirrored, "0")
     assert frame.inliers.all()

@@ -6,6 +6,7 @@ import numpy as np
 from drawn import Array, brute_picture, draw, ellipse, make_scan, placed
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from scipy.special import chdtrc
 from true_marks import ALL_MOVES, KIND, Kind, TrueMark, grainy, some_mark, whitened_rms
 from true_marks import WING as TRUE_WING
 
@@ -14,8 +15,8 @@ from measure.detection.localisation import MarkPrediction
 from measure.fiducials.mark_fit import detect_mark
 from measure.flags import Cause
 from measure.marks import shapes
-from measure.matching.covariance import LinearFit, across_edges
-from measure.noise.noise_model import NoiseModel, combined, products
+from measure.matching.covariance import LinearFit, edge_weights
+from measure.noise.noise_model import NoiseModel, combine, inner_products
 from measure.results import MarkFit, SecondPlace
 from measure.targets.disks import UNIT_DISK, fit_disk
 
@@ -48,7 +49,7 @@ def disks(slope: float, sigma: float, count: int) -> list[MarkFit]:
 
 def chances(places: list[SecondPlace | None]) -> Array:
     assert all(place is not None for place in places)
-    return np.array([place.chance for place in places if place is not None])
+    return np.array([chdtrc(2, place.sigmas**2) for place in places if place is not None])
 
 
 def assert_as_likely(found: Array) -> None:
@@ -75,7 +76,7 @@ def test_where_paint_slopes_its_place_is_nearer_than_the_matched_one() -> None:
     off = np.hypot(*(fit.center_px - DISK_PLACE))
     assert off > 0.05
     assert np.hypot(*(fit.center_px + fit.sloping.offset_px - DISK_PLACE)) < 0.7 * off
-    assert fit.sloping.chance < 1e-6
+    assert chdtrc(2, fit.sloping.sigmas**2) < 1e-6
 
 
 CROSS = shapes.MarkShape(shapes.cross(1.5, 0.15))
@@ -95,7 +96,7 @@ def test_the_sums_are_of_second_derivatives_across_the_edges() -> None:
     rng = np.random.default_rng(8)
     slopes = np.zeros((2, SIZE, SIZE))
     slopes[:, 15:-15, 15:-15] = rng.normal(size=(2, SIZE - 30, SIZE - 30))
-    weights = across_edges(slopes, 1.6)
+    weights = edge_weights(slopes, 1.6)
     row, col = np.mgrid[:SIZE, :SIZE] - SIZE / 2
     for hessian in (np.diag([1.0, 0.0]), np.array([[0.0, 1.0], [1.0, 0.0]]), np.array([[0.4, -0.7], [-0.7, 1.1]])):
         picture = (hessian[0, 0] * col**2 + 2 * hessian[0, 1] * col * row + hessian[1, 1] * row**2) / 2
@@ -152,7 +153,7 @@ def test_what_damage_leaves_next_to_itself_is_a_cause_of_a_marks_covariance() ->
     design, used = np.stack([line, line.T, np.ones_like(line)]), np.ones(line.shape, dtype=bool)
     damaged = np.zeros_like(used)
     damaged[10:14, 20:24] = True
-    by_grey = combined(np.asarray(np.linalg.inv(products(design, design)), np.float64), design)
+    by_grey = combine(np.asarray(np.linalg.inv(inner_products(design, design)), np.float64), design)
     noise = NoiseModel(4.0, np.full((1, 1), 4.0), 0.0)
     fit = LinearFit(np.where(damaged, 1000.0, 0.0), used & ~damaged, design, by_grey, noise, np.ones_like(line))
     margin = gaussian_filter(damaged * 3.2 * 2.0, 1.0, mode="constant")
@@ -184,10 +185,10 @@ def test_a_chip_sampled_too_coarsely_is_found_in_pictures_shifted_by_known_parts
 GROUND, PRECISION_CONTRAST, SNR = 25000.0, 15000.0, 20.0
 
 
-def sighted(mark: TrueMark, grey: np.ndarray, rng: np.random.Generator, rounding_step_dn: float = 0.0) -> MarkFit:
+def sighted(mark: TrueMark, grey: np.ndarray, rng: np.random.Generator, quantisation_step_dn: float = 0.0) -> MarkFit:
     start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + rng.uniform(-1, 1, 2)])
     frame_sigma = mark.kind.known if np.isfinite(mark.kind.known) else None
-    scan, options = make_scan(grey, rounding_step_dn=rounding_step_dn), FiducialOptions().match
+    scan, options = make_scan(grey, quantisation_step_dn=quantisation_step_dn), FiducialOptions().match
     fit = detect_mark(scan, MarkPrediction(mark.kind.shape, start, 3.0, 1), options, frame_sigma).fit
     assert fit is not None
     return fit
@@ -232,7 +233,7 @@ def test_wings_take_rotation_and_scale_from_their_frame() -> None:
     places = [(-25.0, 0.0, 90.0), (25.0, 0.0, -90.0), (0.0, 25.0, 0.0), (3.0, -25.0, 180.0)]
     marks = tuple(
         shapes.LayoutMark(
-            str(number), (x, y), (0.01, 0.01), shapes.turned(shapes.MarkShape(shapes.polygon(TRUE_WING)), turn)
+            str(number), (x, y), (0.01, 0.01), shapes.rotate_mark(shapes.MarkShape(shapes.polygon(TRUE_WING)), turn)
         )
         for number, (x, y, turn) in enumerate(places)
     )

@@ -355,7 +355,7 @@ def test_wrong_ones_are_reported_and_right_ones_as_seldom_as_stated(count: int) 
         wrong = rng.choice(count, count // 10, replace=False)
         angle = rng.uniform(0.0, 2.0 * np.pi, len(wrong))
         view[wrong] += rng.uniform(1.0, 4.0, (len(wrong), 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        chance = compare_targets(targets, view, np.tile(1e-6 * np.eye(2), (count, 1, 1)), SIZE_PX).chance
+        chance = compare_targets(targets, view, np.tile(1e-6 * np.eye(2), (count, 1, 1)), SIZE_PX).p_values
         wrong_chances.append(chance[wrong])
         chances.append(np.delete(chance, wrong))
     right = np.concatenate(chances)
@@ -367,7 +367,7 @@ def test_wrong_ones_are_reported_and_right_ones_as_seldom_as_stated(count: int) 
 def test_a_target_without_others_is_not_doubted() -> None:
     targets, view = target_places(np.random.default_rng(1), 1, np.zeros(1))
     compared = compare_targets(targets, view + 50.0, 1e-6 * np.eye(2)[None], SIZE_PX)
-    assert compared.chance.tolist() == [1.0]
+    assert compared.p_values.tolist() == [1.0]
     assert compared.off_px.shape == (1, 2)
 
 
@@ -375,10 +375,11 @@ def test_points_known_less_well_may_lie_farther_off() -> None:
     rng = np.random.default_rng(5)
     sigma = np.where(np.arange(200) < 20, 1.0, 0.02)
     targets, view = target_places(rng, 200, sigma)
-    chance = compare_targets(targets, view, np.tile(1e-6 * np.eye(2), (200, 1, 1)), SIZE_PX).chance
+    chance = compare_targets(targets, view, np.tile(1e-6 * np.eye(2), (200, 1, 1)), SIZE_PX).p_values
     assert chance.min() > 1e-4
     targets.covariance_px2[:20] = 4e-4 * np.eye(2)
-    assert np.median(compare_targets(targets, view, np.tile(1e-6 * np.eye(2), (200, 1, 1)), SIZE_PX).chance[:20]) < 1e-6
+    compared = compare_targets(targets, view, np.tile(1e-6 * np.eye(2), (200, 1, 1)), SIZE_PX)
+    assert np.median(compared.p_values[:20]) < 1e-6
 
 
 def test_how_far_off_right_ones_lie_is_as_well_known_as_stated() -> None:
@@ -652,7 +653,7 @@ def test_targets_are_odd_by_more_than_noise_and_common_differences(share: float,
 
 def test_a_weak_disk_names_the_cause_of_its_standard_deviation() -> None:
     """Noise of 0.018 px, misfit of 0.65 px: no faint disk."""
-    misfit = Covariance({Cause.NOISE: 0.018**2 * np.eye(2), Cause.UNLIKE_DRAWING: 0.65**2 * np.eye(2)})
+    misfit = Covariance({Cause.NOISE: 0.018**2 * np.eye(2), Cause.MODEL_MISFIT: 0.65**2 * np.eye(2)})
     *reasons, weak = dust_reasons([*[make_disk()] * 8, make_disk(place_covariance=misfit)], [3 * np.eye(2)] * 9)
     assert weak == "its standard deviation is 0.65 px, the largest part from model misfit"
     assert not any(reasons)

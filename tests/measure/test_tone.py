@@ -23,7 +23,7 @@ from measure.fiducials.constellation import Placement
 from measure.fiducials.mark_fit import Detection, detect_mark, options_for
 from measure.fiducials.measure_frame import Frame, measure_frame, shift_to_curve
 from measure.flags import Cause
-from measure.scans.jpeg import covariance_of_compression, rounding_step_dn
+from measure.scans.jpeg import covariance_of_compression, quantisation_step_dn
 from measure.scans.opening import crop_scan, declared_tone
 from measure.tone.curve import LINEAR, Tone, ToneInformation, power, sampled_curve, srgb
 from measure.tone.declared import curve_of_profile
@@ -419,13 +419,13 @@ def test_what_an_unsharp_mask_did_is_undone(amount: float, radius_px: float) -> 
     codes = gaussian_filter(np.random.default_rng(1).standard_normal((120, 110)), 1.0)
     mask = Sharpening(amount, radius_px)
     reach = mask.reach_px
-    undone = mask.undone(sharpened(codes, amount, radius_px))
+    undone = mask.unsharpen(sharpened(codes, amount, radius_px))
     inner = np.s_[reach:-reach, reach:-reach] if 2 * reach < 100 else np.s_[40:-40, 40:-40]
     np.testing.assert_allclose(undone[inner], codes[inner], atol=0.01 * codes.std())
     step = 1e-4
     more = Sharpening(amount + step, radius_px), Sharpening(amount, radius_px * np.exp(step))
     for change, other in zip(mask.changes(undone), more, strict=True):
-        by_step = (undone - other.undone(mask_codes := sharpened(codes, amount, radius_px))) / step
+        by_step = (undone - other.unsharpen(mask_codes := sharpened(codes, amount, radius_px))) / step
         assert mask_codes.shape == change.shape
         np.testing.assert_allclose(change[inner], by_step[inner], atol=0.02 * np.abs(change).max())
 
@@ -433,7 +433,7 @@ def test_what_an_unsharp_mask_did_is_undone(amount: float, radius_px: float) -> 
 def test_a_window_is_read_as_it_was_before_the_scan_was_sharpened() -> None:
     codes = 30000 + 8000 * gaussian_filter(np.random.default_rng(2).standard_normal((150, 150)), 1.5)
     mask = Sharpening(1.5, 1.2)
-    scan = make_scan(sharpened(codes, 1.5, 1.2)).replace_tone(Tone().sharpened(mask))
+    scan = make_scan(sharpened(codes, 1.5, 1.2)).replace_tone(Tone().replace_sharpening(mask))
     np.testing.assert_allclose(scan.light(60, 50, 40, 30), codes[50:80, 60:100], atol=20)
 
 
@@ -527,7 +527,7 @@ def test_the_step_is_that_of_the_luminance_table(quality: int, share: float) -> 
     for picture in (grey, cv2.merge([grey, grey[::-1], grey])):
         data = cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, quality))[1].tobytes()
         expected = np.mean([max(int(step * share + 0.5), 1) for step in COARSE])
-        assert rounding_step_dn(data) == pytest.approx(expected)
+        assert quantisation_step_dn(data) == pytest.approx(expected)
 
 
 def test_tiff_files_have_it_too_and_what_is_not_compressed_with_loss_has_none(tmp_path: Path) -> None:
@@ -536,11 +536,11 @@ def test_tiff_files_have_it_too_and_what_is_not_compressed_with_loss_has_none(tm
         path = tmp_path / f"{level}.tif"
         tifffile.imwrite(path, grey, tile=(32, 32), compression="jpeg", compressionargs={"level": level})
         with measure.open_scan(path) as scan:
-            assert least < scan.rounding_step_dn < most
+            assert least < scan.quantisation_step_dn < most
             assert scan.is_lossy
     tifffile.imwrite(tmp_path / "whole.tif", grey, compression="lzw")
     with measure.open_scan(tmp_path / "whole.tif") as scan:
-        assert scan.rounding_step_dn == 0.0
+        assert scan.quantisation_step_dn == 0.0
         assert not scan.is_lossy
 
 
@@ -571,7 +571,7 @@ def test_a_file_without_loss_tells_that_its_picture_was_jpeg(quality: int, share
             col, row = (0, 0) if name == "colour.png" else (3, 5)  # where blocks begin behind 5 columns and 3 rows
             assert scan.first_block_px == (col, row)
             assert crop_scan(scan, (10, 20, 300, 300)).first_block_px == ((col - 10) % 8, (row - 20) % 8)
-            assert scan.rounding_step_dn == pytest.approx(unit * expected, rel=0.05)
+            assert scan.quantisation_step_dn == pytest.approx(unit * expected, rel=0.05)
             assert "was compressed as JPEG before" in scan.notes[-1]
 
 
@@ -584,7 +584,7 @@ def test_faint_marks_that_jpeg_rounds_are_as_far_off_as_is_stated() -> None:
         [],
     )
     even = np.zeros((48, 48), np.uint8)
-    step_dn = rounding_step_dn(cv2.imencode(".jpg", even, (cv2.IMWRITE_JPEG_QUALITY, 30))[1].tobytes())
+    step_dn = quantisation_step_dn(cv2.imencode(".jpg", even, (cv2.IMWRITE_JPEG_QUALITY, 30))[1].tobytes())
     for number in range(24):
         middle = 23.5 + rng.uniform(-4, 4, 2)
         place = placed(10.0, (middle[0], middle[1]), rng.uniform(0.02, 0.05))

@@ -14,7 +14,7 @@ from projects import comparator_points, present, write_tables
 
 from measure.fiducials.options import SCATTER_MM, BelievedFilm
 from measure.flags import Code, Reason, Status
-from measure.marks.shapes import MarkShape, MarkTemplate, Polygon, turned
+from measure.marks.shapes import MarkShape, MarkTemplate, Polygon, rotate_mark
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement
 from pipeline import InputError, read_images, read_points
 from pipeline.archive.measure_archive import check_measurable
@@ -157,7 +157,7 @@ def test_marks_are_turned_with_their_place_and_written_so(tmp_path: Path) -> Non
         mark = each.fiducials[0].mark
         assert isinstance(mark, MarkShape)
         np.testing.assert_allclose(present(mark.true_mm), [[-1.0, -0.5], [1.0, 2.0]])  # outwards is up there
-        askew = turned(mark, 30.0)
+        askew = rotate_mark(mark, 30.0)
     assert isinstance(askew, MarkShape)
     scale = 2.0 / (2.0 * 3**0.5 / 2 + 1.25)
     np.testing.assert_allclose(np.ptp(present(askew.true_mm), axis=0), np.array([2.0, 2.5]) * scale)

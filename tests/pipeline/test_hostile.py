@@ -310,10 +310,10 @@ def decisions_trial(rng: random.Random, folder: Path, adjusted: Path) -> str:
     choices = (DecisionKind.ACCEPT, DecisionKind.REJECT, DecisionKind.ABSENT, DecisionKind.UNDO)
     lines = [Decision(rng.choice("abz"), rng.choice(choices), rng.choice("129"), "fiducial") for _ in range(8)]
     append_decisions(path, lines)
-    if is_spoilt := rng.random() < 0.7:
+    if is_mostly_damaged := rng.random() < 0.7:
         path.write_bytes(change_bytes(path.read_bytes(), rng))
     read = read_decisions(path)
-    if not is_spoilt and read != tuple(lines):
+    if not is_mostly_damaged and read != tuple(lines):
         return WRONG
     bad = Decision("a", DecisionKind.PLACE, "1", "fiducial", col_px=rng.choice([float("nan"), 1e300]), row_px=1.0)
     before = path.read_bytes()
