@@ -126,8 +126,6 @@ class Cause(MeaningfulWord):
     """Cause of a part of a covariance, in the order in which the parts are listed."""
 
     NOISE = "noise", "Film grain and scanner noise, estimated from the image."
-    ROUNDING = "rounding", "Quantisation of the grey values."
-    SECOND_ORDER = "second order", "Second-order effects of position, blur and contrast for a soft and faint mark."
     MODEL_MISFIT = (
         "unlike drawing",
         "Model misfit: at the edges the image differs from the drawing by more than noise.",

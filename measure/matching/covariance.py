@@ -33,7 +33,6 @@ _BESIDE_DAMAGE_PX = 1.0  # px, standard deviation of the Gaussian weights for fa
 _TEXTURE_PX = 8  # px, largest lag of the autocovariance of texture
 _SMOOTH_PX = 0.8  # px, smoothing of residuals that separates texture from noise, as for damage
 _CUT_SIGMAS = 3.2  # noise standard deviations beyond which residuals are masked as damage
-_LEAST_SLOPE = 1e-3  # lower bound of the slope of a clipped grey value, to divide by
 _MOSTLY = 0.5  # fraction of a pixel's light that assigns it to one side of the edge
 _LEAST_PX = 400  # pixels of the frame needed to estimate the background's texture
 # Standard deviation of the error of half tones, in units of contrast times log contrast change: uniform between 0 and
@@ -170,41 +169,6 @@ class LinearFit:
         return np.clip(self.residuals, -limit_dn, limit_dn)
 
 
-def second_order(design: Array, slopes: Array, used: Mask, covariance: Array, priors_dn2: Array) -> float:
-    """Relative increase of the place's variance over that of the linearised adjustment, by second-order terms.
-
-    Parameters
-    ----------
-    design : (unknowns, height, width) derivatives of the model; the first two by column and row, the last four by the
-        greys.
-    slopes : (height, width) slopes of clipped grey values, 1 elsewhere.
-    used : (height, width) mask of the pixels used.
-    covariance : (unknowns, unknowns)
-    priors_dn2 : (unknowns,) weights of the priors relative to that of a pixel.
-
-    Notes
-    -----
-    Second derivatives are weighted pixel by pixel. Grain enters through the covariance only, because its weights would
-    amplify the second derivatives as they amplify no noise.
-    """
-    moving = len(design) - GREY + 1  # all but the background's
-    among, used_design = covariance[:moving, :moving], design * used
-    # Second derivatives by the place: minus the gradients of all columns that move with the mark.
-    whole = design[:moving] / np.maximum(slopes, _LEAST_SLOPE)
-    changes = np.concatenate(np.gradient(whole, axis=(2, 1))) * (-slopes * used)
-    normal, shared = inner_products(used_design, used_design), inner_products(used_design, changes)
-    inverse: Array = np.asarray(np.linalg.inv(normal + np.diag(priors_dn2)), float)
-    taken_up = np.asarray(inverse @ shared, float)
-    by_unknown = np.trace(taken_up[:2].reshape(2, 2, moving))  # minus the derivatives of the variance's logarithm
-    both = taken_up.T @ shared
-    left = inner_products(changes, changes) - both - both.T + taken_up.T @ normal @ taken_up
-    turning = np.einsum("jl,ijml->im", among, left.reshape(2, moving, 2, moving))
-    by_noise = np.asarray(inverse @ normal @ inverse, float)
-    curvature = np.trace(by_noise[:2, :2] @ turning) / 2
-    # Noisy lags of the autocovariance may leave the covariance of the other unknowns indefinite.
-    return max(float(curvature + by_unknown @ among @ by_unknown / 2), 0.0)
-
-
 # Causes of uncertainty that leave no residuals: background texture within the mark, and changed half tones.
 #
 # A notch in the frame's border is exposed like the frame: its light varies like the terrain. A gradient of that light
@@ -244,14 +208,9 @@ class BackgroundTexture:
 def place_covariance(
     fit: PictureFit, linear: LinearFit, covariance: Array, background: BackgroundTexture
 ) -> Covariance:
-    """Covariance of the place by its causes. covariance (unknowns, unknowns): by noise, rounding included."""
+    """Covariance of the place by its causes. covariance (unknowns, unknowns): by noise."""
     model, by_grey, by_noise = fit.model, linear.by_grey, covariance[:2, :2]
-    rounded = fit.quantisation_variance_dn2 * np.trace(inner_products(by_grey[:2], by_grey[:2]))
-    share = min(float(rounded / np.trace(by_noise)), 1.0)
-    place = Covariance.from_noise((1 - share) * by_noise).plus(Cause.ROUNDING, share * by_noise)
-    priors_dn2 = model.prior_weights * linear.noise.variance_dn2
-    more = second_order(model.design, model.slopes, fit.used, covariance, priors_dn2)
-    place = place.plus(Cause.SECOND_ORDER, more * by_noise)
+    place = Covariance.from_noise(by_noise)
     if isinstance(model.mark, MarkTemplate) and model.mark.steadiness is not None:
         change = fit.contrast_dn / float(np.ptp(model.mark.image))
         place = place.plus(Cause.CHANGED_TONES, covariance_of_changed_tone(model.half_tones, by_grey, change))

@@ -37,7 +37,6 @@ _LEAST_AREA_PX = 40  # pixels required around a mark
 _DAMAGE_SIGMAS = 3.2  # of smoothed residuals: exceeded by one pixel in 700 without damage
 _PLAIN, _PLAIN_SHARE = 2.0, 0.7  # variance ratio that grain may produce; fraction of far pixels that must be undamaged
 _LEAST_VARIANCE_DN2 = 1e-12  # lower bound for images without noise, to divide by
-_ROUNDING_VARIANCE = 1 / 12  # variance of the rounding error, in squared steps
 _WEIGHTED_STEPS = 4  # steps with the grain's weights; the place is nearly final before
 _CLOSE_PX, _SETTLED_PX = 0.002, 0.02  # px: step that ends the iteration; longest last step accepted as converged
 _OUTLINE_BLUR_PX, _SHOWN = 0.3, 0.02  # blur (px) and fraction of the contrast that delimit the mark itself
@@ -336,15 +335,6 @@ class PictureFit:
     def floor_dn(self) -> float:
         """Grey value below which residuals may be errors of the drawing."""
         return _FLOOR * self.contrast_dn
-
-    @property
-    def quantisation_variance_dn2(self) -> float:
-        """Variance of rounding to whole grey values; 0 if the values were compressed or smoothed afterwards."""
-        model = self.model
-        ordinary = self.used & (model.clipped == 0)
-        is_whole = not (self.window.is_lossy or model.is_chip) and model.background_px is None
-        steps = self.window.coding.steps_dn(ordinary) if is_whole else None
-        return 0.0 if steps is None else _ROUNDING_VARIANCE * float(np.mean((steps * model.steadiness)[ordinary] ** 2))
 
     @property
     def informative(self) -> Mask:

@@ -133,7 +133,6 @@ def _mark_fit(fit: PictureFit, window: ScanWindow) -> MarkFit:
     model, used = fit.model, fit.informative
     information = float(model.information[fit.used].sum())
     noise, is_white = white_noise_model(model.scores, fit.used, len(model.design), information)
-    noise = noise.raise_variance(fit.quantisation_variance_dn2)
     unknown = np.full((len(model.design),) * 2, np.inf)
     grey = np.asarray(window.grey, float)
     precision: dict[str, Any] = {

@@ -46,20 +46,6 @@ class Coding:
     tone: Tone = LINEAR
     full_scale_dn: float = 65535.0
 
-    def steps_dn(self, used: Mask) -> Array | None:
-        """(height, width) quantisation steps in light. None where the used values are unknown or not multiples of one
-        step."""
-        if self.stored is None:
-            return None
-        gaps = np.diff(np.unique(np.asarray(self.stored[used], float)))
-        step = float(gaps.min(initial=np.inf))
-        if not np.isfinite(step) or np.any(gaps % step):
-            return None
-        if self.tone.is_identity:
-            return np.full(self.stored.shape, step)
-        above, below = (self.tone.light(self.stored + way * step / 2, self.full_scale_dn) for way in (1, -1))
-        return np.asarray(above - below, float)
-
     def light_of_step_dn(self, light: NDArray[np.floating], step_dn: float) -> Array:
         """Change of the light for a change of step_dn in the stored grey value."""
         if self.tone.is_identity:

@@ -28,6 +28,7 @@ MARK_COLUMNS = (
     "quality",
 )  # fmt: skip
 _KINDS: Mapping[str, Kind] = {kind: kind for kind in get_args(Kind)}
+_CAUSES: Mapping[str, Cause] = {str(cause): cause for cause in Cause}
 _POSE, _LINES = TypeAdapter(ScanOrientation), TypeAdapter(tuple[Line, ...])
 
 
@@ -180,11 +181,19 @@ def _read_mark(row: Sequence[Any]) -> MarkMeasurement:
         point=point,
         kind=_KINDS[kind],
         center_px=None if col is None else _array([col, row_px]),
-        covariance=None if parts is None else Covariance({Cause(name): _array(px2) for name, px2 in parts.items()}),
+        covariance=None if parts is None else _read_covariance(parts),
         status=Status(status),
         reason=Reason.read(reason, code),
         quality={name: float(value) for name, value in json.loads(quality).items()},
     )
+
+
+def _read_covariance(parts: Mapping[str, Any]) -> Covariance:
+    """Covariance of its parts by cause; causes that only earlier versions know count as noise."""
+    covariance = Covariance({})
+    for name, px2 in parts.items():
+        covariance = covariance.plus(_CAUSES.get(name, Cause.NOISE), _array(px2))
+    return covariance
 
 
 def finite_or_none(value: float) -> float | None:

@@ -10,7 +10,6 @@ from true_marks import KIND, TrueMark, some_mark, whitened_rms
 from measure import FiducialOptions, MarkFit, MatchOptions, match
 from measure.detection.localisation import MarkPrediction
 from measure.fiducials.mark_fit import detect_mark
-from measure.matching.covariance import second_order
 from measure.matching.window import clipped_ends, noise_scale, read_window
 from measure.noise.grain import _KERNELS, GRAIN_PX, PATCH_PX, PLANE, grain_model
 from measure.noise.noise_model import influence_covariances, noise_model, steadiness
@@ -131,24 +130,6 @@ def test_coarse_grain_is_distinguished_from_a_landscape(grain_px: float, is_grai
     if is_grain:  # blank film that holds more pixels than the window alone tells how strong it is
         assert model.variance_dn2 == pytest.approx(1.0, rel=0.1)
         assert grain_model(3.0 * window, used, design, neighbours, patches).variance_dn2 == model.variance_dn2
-
-
-@pytest.mark.parametrize("noise_dn", [1.0, 10.0])
-def test_second_order_of_a_gaussian_spot(noise_dn: float) -> None:
-    """Of a spot of known width s its place and gain are unknown. With V the variance of a coordinate that of the gain
-    is V / 2 s² of its square, and by the integrals of a Gaussian's derivatives the curvature is 3/2 V / s²."""
-    gain, width = 100.0, 6.0
-    row, col = np.mgrid[-70:71, -70:71].astype(float)
-    col, row = col - 0.3, row + 0.2
-    spot = np.exp(-(col**2 + row**2) / (2 * width**2))
-    slopes = gain * spot * np.stack([col, row]) / width**2
-    design = np.concatenate([slopes, np.stack([spot, np.ones_like(spot), col / 50, row / 50])])
-    flat = design.reshape(len(design), -1)
-    covariance = noise_dn**2 * np.linalg.inv(flat @ flat.T)
-    variance = 2 * noise_dn**2 / (np.pi * gain**2)
-    assert covariance[0, 0] == pytest.approx(variance, rel=0.01)
-    share = second_order(design, np.ones_like(spot), np.ones(spot.shape, bool), covariance, np.zeros(len(design)))
-    assert share == pytest.approx((3 / 2 + 2 / 2) * variance / width**2, rel=0.03)
 
 
 CLIPPING_FULL, CONTRAST = 65535.0, 20000.0
