@@ -33,7 +33,7 @@ from measure.matching.gauss_newton import UNDETERMINED, UNSETTLED
 from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.matching.window import ScanWindow
 from measure.noise.noise_model import covariance_along, influence_covariances
-from measure.noise.robust_estimation import gauss_newton_step, robust_scale, tukey_weights
+from measure.noise.robust_estimation import gauss_newton_step, place_influences, robust_scale, tukey_weights
 from measure.results import Covariance
 from measure.scans.jpeg import covariances_of_rounding
 
@@ -293,9 +293,7 @@ class _CornerFits:
         design, residuals = self.design, self.residuals
         area, used = self._area(np.arange(len(self.windows))), self.weights > _UNDAMAGED
         used &= design[:, _SHAPE_UNKNOWNS + 1] != 0  # the offset's derivative is 0 for clipped pixels only
-        weighted = design * self.weights[:, None]
-        normal = (weighted @ design.swapaxes(1, 2)).astype(float)
-        influence = self._pictures(np.linalg.pinv(normal, hermitian=True)[:, :2].astype(np.float32) @ weighted)
+        influence = self._pictures(place_influences(design, self.weights))
         covariances, variances = influence_covariances(
             influence, self._pictures(residuals), self._pictures(used), self.unknowns
         )

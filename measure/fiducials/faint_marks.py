@@ -217,11 +217,6 @@ class _Field:
         if detail == 0.0:  # a patch of one grey value, painted over: the response is rounding
             return None
         shown, drawn = lit > _LINE * lit.max(), lines > _LINE * lines.max()
-        # The mark's own rotation and scale, for lines off to one side of its point, assumed at their centroid.
-        rows, cols = np.indices(lit.shape) - self.half
-        weights = lit * self.room[patch]
-        middle_px = np.array([(weights * cols).sum(), (weights * rows).sum()]) / weights.sum() - response.fraction
-        leaning_px2 = _OWN_LINEAR**2 * self.step**2 * (middle_px @ middle_px) * np.eye(2)
         room_dn, ground_dn, texture_dn = (
             float(np.average(image[patch], weights=lit)) for image in (self.room_dn, self.ground_dn, self.texture_dn)
         )
@@ -233,7 +228,9 @@ class _Field:
             converged=True,
             reason=NO_REASON,
             center_px=place,
-            place_covariance=Covariance.from_noise(inverse @ slopes @ inverse).plus(Cause.ROTATION, leaning_px2),
+            place_covariance=Covariance.from_noise(inverse @ slopes @ inverse).plus(
+                Cause.ROTATION, self._rotation_px2(response, lit)
+            ),
             pixel_from_mark=np.column_stack([self.linear * self.step, place]),
             contrast_dn=contrast_dn,
             stored_contrast_dn=self.coding.stored_contrast_dn(ground_dn, contrast_dn),
@@ -245,12 +242,16 @@ class _Field:
             likeness=min(height / detail, 1.0),
             significance=height / scatter,
         )
-        # Expected number of maxima as strong in a circle, for a Gaussian field: Adler's expected Euler characteristic
-        # of the excursion set.
         distance_px = max(float(np.hypot(*(center - self.predicted))), _LEAST_DISTANCE_PX)
-        strength, spread = height / scatter, np.sqrt(np.linalg.det(slopes / scatter**2))
-        density = spread * (2 * np.pi) ** -1.5 * strength * np.exp(-(strength**2) / 2)
-        return FaintMark(fit, float(np.pi * distance_px**2 * density))
+        return FaintMark(fit, _expected_maxima(height / scatter, slopes / scatter**2, distance_px))
+
+    def _rotation_px2(self, response: "_Response", lit: Array) -> Array:
+        """(2, 2) covariance of the place by the mark's own rotation and scale, for lines off to one side of its point,
+        assumed at their centroid. lit: the template times the room for contrast."""
+        rows, cols = np.indices(lit.shape) - self.half
+        weights = lit * self.room[response.patch]
+        middle_px = np.array([(weights * cols).sum(), (weights * rows).sum()]) / weights.sum() - response.fraction
+        return np.asarray(_OWN_LINEAR**2 * self.step**2 * (middle_px @ middle_px) * np.eye(2))
 
     def _texture(self, response: "_Response", signal: Array) -> Mask:
         """Mask of the places around the mark whose response is that of the texture alone and where a mark could be
@@ -261,6 +262,13 @@ class _Field:
         whole[self.half : -self.half, self.half : -self.half] = True
         alone = np.abs(signal) < _SELF * signal[row, col]
         return np.asarray(near & whole & alone & (response.norm > _SHOWN * response.norm[row, col]))
+
+
+def _expected_maxima(strength: float, slopes: Array, radius_px: float) -> float:
+    """Expected number of maxima of a Gaussian field in a circle that exceed a strength, in its standard deviations, by
+    the expected Euler characteristic of the excursion set (Adler). slopes (2, 2): covariance of the gradient."""
+    density = np.sqrt(np.linalg.det(slopes)) * (2 * np.pi) ** -1.5 * strength * np.exp(-(strength**2) / 2)
+    return float(np.pi * radius_px**2 * density)
 
 
 class _Response:

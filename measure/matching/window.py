@@ -191,7 +191,7 @@ def clipped_ends(samples: Samples, full_scale_dn: float, weights: Sequence[float
 
 
 def deviance_residuals(residuals: Array, ends: ClippedEnds, sigma_dn: float) -> tuple[Array, Array, Array]:
-    """Compute the deviance residuals of clipped grey values. residuals (n,): grey value minus model; sides (n,):
+    """Compute the deviance residuals of clipped grey values. residuals (n,): grey value minus model; ends (n,):
     clipped end; sigma_dn: standard deviation of the noise.
 
     Returns
@@ -208,7 +208,7 @@ def deviance_residuals(residuals: Array, ends: ClippedEnds, sigma_dn: float) -> 
 
 
 def noise_scale(residuals: Array, ends: ClippedEnds, start_dn: float, least_dn: float) -> float:
-    """Estimate the standard deviation of the noise by maximum likelihood from residuals and sides (n,), some clipped.
+    """Estimate the standard deviation of the noise by maximum likelihood from residuals and clipped ends (n,), some clipped.
 
     Returns at least least_dn; start_dn: rough initial value. The mean square of an observation's score (its residual
     if ordinary) equals its information in units of the variance. Residuals more than _GROSS standard deviations within

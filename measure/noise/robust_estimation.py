@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from measure.array_types import Array, Mask
+from measure.array_types import Array, Mask, Single
 
 Real = TypeVar("Real", np.float32, np.float64)
 
@@ -49,6 +49,14 @@ def gauss_newton_step(design: NDArray[Real], residuals: NDArray[Real], weights: 
     size = np.sqrt(np.maximum(np.einsum("...uu->...u", normal), 1e-12))
     scaled = normal / (size[..., :, None] * size[..., None, :]) + damping * np.eye(normal.shape[-1])
     return np.asarray(np.linalg.solve(scaled, right / size[..., None])[..., 0] / size)
+
+
+def place_influences(design: NDArray[Real], weights: NDArray[Real]) -> Single:
+    """(n, 2, observations) derivatives of the first two unknowns of n fits by their observations. design (n, unknowns,
+    observations), weights (n, observations)."""
+    weighted = design * weights[:, None]
+    inverse = np.linalg.pinv((weighted @ design.swapaxes(1, 2)).astype(float), hermitian=True)
+    return np.asarray(inverse[:, :2].astype(np.float32) @ weighted, np.float32)
 
 
 def solution(normal: Array, right: Array, free: Mask) -> Array | None:

@@ -14,7 +14,7 @@ from measure.array_types import Array, Indices, Mask, Single
 from measure.flags import NO_REASON, Code, Reason
 from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.noise.noise_model import influence_covariances
-from measure.noise.robust_estimation import SIGMA_OF_DEVIATION, gauss_newton_step, tukey_weights
+from measure.noise.robust_estimation import SIGMA_OF_DEVIATION, gauss_newton_step, place_influences, tukey_weights
 from measure.results import Covariance, MarkFit
 from measure.targets.block_search import Patches, ScanBlock, concatenate
 
@@ -95,11 +95,11 @@ def place_disks(block: ScanBlock, patches: Patches, margins_px: Array) -> list[M
 
 def _groups(patches: Patches, strides: Indices, margins_px: Array) -> Iterator[Indices]:
     """Indices of patches with windows of similar size, in groups of limited pixel count."""
-    ends = 2 * _half_sides(patches, strides, margins_px) + 1
-    rest = np.argsort(-ends, kind="stable")
+    sides = 2 * _half_sides(patches, strides, margins_px) + 1
+    rest = np.argsort(-sides, kind="stable")
     while len(rest):
-        own = rest[: max(_GROUP_PIXELS // int(ends[rest[0]]) ** 2, 1)]
-        own = own[2 * ends[own] >= ends[rest[0]]]
+        own = rest[: max(_GROUP_PIXELS // int(sides[rest[0]]) ** 2, 1)]
+        own = own[2 * sides[own] >= sides[rest[0]]]
         yield own
         rest = rest[len(own) :]
 
@@ -181,9 +181,7 @@ class _DiskFit:
         """The disks in scan pixels, with covariances."""
         weights, found = self._weights(), self.patches()
         counted = weights > _UNDAMAGED
-        weighted = self.design * weights[:, None]
-        inverse = np.linalg.pinv((weighted @ self.design.swapaxes(1, 2)).astype(float), hermitian=True)
-        influence = self.shapes.astype(np.float32) @ (inverse[:, :2].astype(np.float32) @ weighted)
+        influence = self.shapes.astype(np.float32) @ place_influences(self.design, weights)
         size = len(weights), -1, self.side, self.side
         covariances, variances = influence_covariances(
             influence.reshape(size), self.residuals.reshape(size)[:, 0], counted.reshape(size)[:, 0], _UNKNOWNS

@@ -303,7 +303,8 @@ class TieOptions:
 
 @dataclass(frozen=True, eq=False)
 class Ties:
-    """Tie points by image, and problems by image, a sentence each; those of all scans stand with the first one."""
+    """Tie points, or joins, by image, and problems by image, a sentence each; those of all scans stand with the first
+    one."""
 
     marks: Mapping[str, tuple[MarkMeasurement, ...]]
     problems: Mapping[str, tuple[Reason, ...]]

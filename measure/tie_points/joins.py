@@ -6,9 +6,8 @@ what moves unlike its neighbours is dust on the scanner's glass or a false match
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
 from functools import partial
 from itertools import combinations, compress
 
@@ -28,6 +27,7 @@ from measure.tie_points.features import (
     read_pieces,
     shared_features,
 )
+from measure.tie_points.find_points import Ties
 from measure.tie_points.multi_image import RADIUS_PX, Matched, match_pieces
 from measure.tie_points.tracks import neighbour_outliers
 
@@ -52,15 +52,7 @@ _UNJOINED = "It is not joined to the other scans of its frame"
 _MatchedPair = tuple[Matched, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class Joins:
-    """Joins by image, and the problem of each scan with few or none."""
-
-    marks: Mapping[str, tuple[MarkMeasurement, ...]]
-    problems: Mapping[str, Reason]
-
-
-def measure_joins(parts: Sequence[TieFrame], wanted: int = WANTED, workers: Executor | None = None) -> Joins:
+def measure_joins(parts: Sequence[TieFrame], wanted: int = WANTED, workers: Executor | None = None) -> Ties:
     """Measure the joins of one frame's scans.
 
     An unreadable scan has no joins and a problem that says why; image content never raises an error. The result does
@@ -74,7 +66,7 @@ def measure_joins(parts: Sequence[TieFrame], wanted: int = WANTED, workers: Exec
     readable = [(part, each) for part, each in zip(parts, found, strict=True) if isinstance(each, Features)]
     marks: dict[str, list[MarkMeasurement]] = {part.image: [] for part, _ in readable}
     agreements: dict[str, list[str]] = {part.image: [] for part, _ in readable}
-    problems, number = dict[str, Reason](), 0
+    problems, number = dict[str, tuple[Reason, ...]](), 0
     for (first, first_features), (second, second_features) in combinations(readable, 2):
         both = first, second
         second_from_first, agreement = _match_features(first_features, second_features)
@@ -89,16 +81,17 @@ def measure_joins(parts: Sequence[TieFrame], wanted: int = WANTED, workers: Exec
             for part, matched in zip(both, pair, strict=True):
                 marks[part.image].append(_mark(f"join{number:04d}", matched))
         if len(pairs) < _FEW:
-            problems |= {part.image: _few_joins_problem(both, len(pairs), refused) for part in both}
+            problems |= {part.image: (_few_joins_problem(both, len(pairs), refused),) for part in both}
     for image, own in marks.items():
         if not any(mark.status.is_observation for mark in own):
-            problems[image] = Reason(
+            unjoined = Reason(
                 f"Nothing joins it to the other scans of its frame: {'; '.join(agreements[image])}; at least {_FEWEST} "
                 "are needed. Check whether it is a scan of that frame, and whether the scans overlap.",
                 Code.FEW_TIES,
             )
-    problems |= {part.image: each for part, each in zip(parts, found, strict=True) if isinstance(each, Reason)}
-    return Joins({image: tuple(own) for image, own in marks.items()}, problems)
+            problems[image] = (unjoined,)
+    problems |= {part.image: (each,) for part, each in zip(parts, found, strict=True) if isinstance(each, Reason)}
+    return Ties({image: tuple(own) for image, own in marks.items()}, problems)
 
 
 def _match_features(first: Features, second: Features) -> tuple[Array | None, str]:

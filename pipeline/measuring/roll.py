@@ -11,7 +11,7 @@ from measure.annotations.lines import KnownLine, Line, masked_text
 from measure.boards.measure import one_definition
 from measure.fiducials.across_frames import check_frames
 from measure.fiducials.options import BelievedFilm
-from measure.fiducials.scan_orientation import DECIDED, TOLD, bounded, line_score
+from measure.fiducials.scan_orientation import DECIDED, LEAST_REPORTED, bounded, line_score
 from measure.flags import Code, Reason, Status
 from measure.geometry import POSES, UP_FROM_CAMERA, pose_in_camera
 from measure.marks.shapes import WrittenPlace
@@ -133,7 +133,7 @@ def poses_of_roll(scans: Sequence[MeasuredScan], places: Sequence[WrittenPlace])
     likelihoods = _writing_likelihoods([frame for frame in frames if frame.image in poses], places)
     alike = [turn for turn in _TURNS if likelihoods[turn] > -DECIDED]
     usual = Counter(_turn(pose) for pose in poses.values())
-    chosen = max(alike, key=lambda turn: (likelihoods[turn] > -TOLD, usual[turn]))
+    chosen = max(alike, key=lambda turn: (likelihoods[turn] > -LEAST_REPORTED, usual[turn]))
     undecided = [frame for frame in frames if frame.image in poses and not poses[frame.image].decided]
     return {frame.image: _joint_orientation(frame, chosen, len(alike) == 1, len(poses)) for frame in undecided}
 

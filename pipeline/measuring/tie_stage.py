@@ -59,8 +59,7 @@ def add_joins(
                 occupied = _occupied_places([mark for mark in scan.frame.marks if mark.kind == "fiducial"])
                 frames.append(TieFrame(name, path, np.eye(2, 3), None, occupied, project.max_pixels))
             joins = measure_joins(frames, workers=workers)
-            problems = {image: (problem,) for image, problem in joins.problems.items()}
-            with_joins = [_add_marks(scan, joins.marks, problems) for scan in parts]
+            with_joins = [_add_marks(scan, joins.marks, joins.problems) for scan in parts]
             joined |= {scan.frame.image: scan for scan in _check_fiducials_by_joins(with_joins)}
         count(frame, done, len(by_frame))
     return tuple(joined.get(scan.frame.image, scan) for scan in scans)

@@ -14,7 +14,8 @@ from studies import parametrize_with_studies
 
 from measure.flags import Cause
 from measure.tie_points.features import Features, TieFrame
-from measure.tie_points.joins import Joins, measure_joins
+from measure.tie_points.find_points import Ties
+from measure.tie_points.joins import measure_joins
 from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Piece, match_pieces
 from measure.tie_points.tracks import find_candidates, neighbour_outliers, tracks_of_pairs, verify_pairs
 
@@ -238,7 +239,7 @@ def scanned(folder: Path, noise: float, rows: int = ROWS) -> tuple[list[TieFrame
     return parts, move - (first, 0)
 
 
-def off_and_sigma(joins: Joins, move: Array) -> tuple[Array, Array]:
+def off_and_sigma(joins: Ties, move: Array) -> tuple[Array, Array]:
     pairs = zip(joins.marks["a"], joins.marks["b"], strict=True)
     off, variance = [], []
     for one, other in pairs:
@@ -282,4 +283,4 @@ def test_a_scan_that_cannot_be_read_costs_the_other_nothing(tmp_path: Path) -> N
     parts, _ = scanned(tmp_path, 500.0)
     (tmp_path / "b.tif").write_bytes(b"no picture")
     joins = measure_joins(parts)
-    assert "It is not joined to the other scans of its frame" in joins.problems["b"]
+    assert "It is not joined to the other scans of its frame" in joins.problems["b"][0]

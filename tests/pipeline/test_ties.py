@@ -460,7 +460,7 @@ def test_scans_that_have_nothing_in_common_are_reported(tmp_path: Path) -> None:
     joins = measure_joins(parts)
     assert not joins.marks["a"]
     assert not joins.marks["b"]
-    assert "Nothing joins it to the other scans of its frame: with b" in joins.problems["a"]
+    assert "Nothing joins it to the other scans of its frame: with b" in joins.problems["a"][0]
 
 
 @pytest.mark.study
