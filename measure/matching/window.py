@@ -208,7 +208,8 @@ def deviance_residuals(residuals: Array, ends: ClippedEnds, sigma_dn: float) -> 
 
 
 def noise_scale(residuals: Array, ends: ClippedEnds, start_dn: float, least_dn: float) -> float:
-    """Estimate the standard deviation of the noise by maximum likelihood from residuals and clipped ends (n,), some clipped.
+    """Estimate the standard deviation of the noise by maximum likelihood from residuals (n,), some clipped
+    at ends (n,).
 
     Returns at least least_dn; start_dn: rough initial value. The mean square of an observation's score (its residual
     if ordinary) equals its information in units of the variance. Residuals more than _GROSS standard deviations within

@@ -20,17 +20,22 @@ from measure.scans.jpeg import (
     jpeg_pitch,
     open_jpeg,
 )
-from measure.scans.jpeg2000 import (
+from measure.scans.metadata import DECODING_ERRORS, PictureForm, Pitch, Samples, damage_error
+from measure.scans.parallel import map_in_threads
+from measure.scans.png_and_jpeg2000 import (
     JPEG2000_END,
     JPEG2000_STARTS,
+    PNG_END,
+    PNG_START,
     jpeg2000_colour_tags,
     jpeg2000_form,
     jpeg2000_pitch,
     open_jpeg2000,
+    open_png,
+    png_colour_tags,
+    png_form,
+    png_pitch,
 )
-from measure.scans.metadata import DECODING_ERRORS, PictureForm, Pitch, Samples, damage_error
-from measure.scans.parallel import map_in_threads
-from measure.scans.png import PNG_END, PNG_START, open_png, png_colour_tags, png_form, png_pitch
 from measure.scans.remote import Address, ScanPart, Window, scan_path
 from measure.scans.scan import Scan
 from measure.scans.tiff import TIFF_STARTS, open_tiff, tiff_colour_tags
