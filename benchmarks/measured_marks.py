@@ -22,7 +22,7 @@ SHIFT_PX, SEARCH_PX = 1.5, 3.0  # px, error of the start, and radius of the sear
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Measured place with its covariance. flagged: reason if `weak` or not measured, "" otherwise; unlike_drawing_px2:
+    """Measured place with its covariance. flagged: reason if `weak` or not measured, "" otherwise; model_misfit_px2:
     covariance of the cause model misfit."""
 
     center_px: Array

@@ -21,7 +21,7 @@ Kind = Literal["fiducial", "target", "tie", "join"]
 ON_FILM: tuple[Kind, ...] = ("fiducial", "join")  # kinds that are points of the film, not of the object
 # Stored results are reused only if this is unchanged. Increase it whenever measurements would change:
 # tests/measure/test_revision.py fails if that was forgotten.
-MEASURE_REVISION = 49
+MEASURE_REVISION = 50
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -124,7 +124,7 @@ class MarkMeasurement:
         """Name, status, place, standard deviations and reason as text; empty where not available."""
         place = "" if self.center_px is None else f"({self.center_px[0]:.3f}, {self.center_px[1]:.3f})"
         sigmas = None if self.covariance_px2 is None else np.sqrt(np.diag(self.covariance_px2))
-        sigmas_text = "" if sigmas is None else f"+- ({sigmas[0]:.3f}, {sigmas[1]:.3f})"
+        sigmas_text = "" if sigmas is None else f"± ({sigmas[0]:.3f}, {sigmas[1]:.3f})"
         return self.point, str(self.status), place, sigmas_text, str(self.reason)
 
 

@@ -192,7 +192,7 @@ def fit_corners(
     first_block_px: tuple[int, int],
 ) -> list[Corner]:
     """Fit all corners of a board at once. read: returns the square window with the given first column, first row and
-    side, px; surface: `crossing` or `quarter`; rounding_step_dn, first_block_px: of the scan."""
+    side, px; surface: `crossing` or `quarter`; quantisation_step_dn, first_block_px: of the scan."""
     if not starts:
         return []
     half = max(start.half_px for start in starts)

@@ -152,7 +152,7 @@ class _Field:
             np.asarray(means(each[..., None], step)[..., 0])
             for each in (scan.light(*window, expected.weights), scan.inside(*window).astype(np.float32))
         )
-        self.coding = Coding(None, scan.tone, scan.full_scale_dn)
+        self.coding = Coding(scan.tone, scan.full_scale_dn)
         self.ground_dn = ground = np.asarray(cv2.GaussianBlur(light, (0, 0), self.coarse_px), np.float32)
         detail = light - ground
         spread = cv2.GaussianBlur(detail**2, (0, 0), _TEXTURE * self.coarse_px)

@@ -332,7 +332,7 @@ def measure_parts(
     """
     groups = lines_and_rounds(mark)
     place = pixel_from_mark - np.column_stack([np.zeros((2, 2)), window.origin_px])
-    (height, width), used = window.grey.shape, window.usable & (window.sides == 0)
+    (height, width), used = window.grey.shape, window.usable & (window.ends == 0)
     planes, grey, offsets = background_planes(height, width), window.grey[used], np.zeros((2, 2))
     for number in range(_PART_STEPS):
         first, second = (

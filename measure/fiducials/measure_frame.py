@@ -804,7 +804,7 @@ def _compare_parts(frame: Frame) -> Frame:
         if isinstance(mark, MarkShape) and lines_and_rounds(mark):
             found = measure_parts(*_window_of(frame, index, fit), fit)
             reason, px2 = parts_apart(*found) if found else (NO_REASON, np.zeros((2, 2)))
-            amended[index] = frame.detections[index].amend(reason, parts={Cause.UNLIKE_DRAWING: px2})
+            amended[index] = frame.detections[index].amend(reason, parts={Cause.MODEL_MISFIT: px2})
     return frame.replace_detections(amended)
 
 

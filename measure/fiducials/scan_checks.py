@@ -44,7 +44,7 @@ def pitch_problem(
     is_named = any(Code.PITCH in problem.codes for problem in frame.problems)  # unequal pixel sizes
     if frame.pixel_from_camera is None or len(marks) < _LEAST_MARKS or is_named:
         return None
-    film_um = 1000 / np.hypot(*frame.pixel_from_camera[:, :2].T)  # film per pixel, um, across and down
+    film_um = 1000 / np.hypot(*frame.pixel_from_camera[:, :2].T)  # film per pixel, µm, across and down
     places = places_mm(marks)
     lever_mm = float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=0)).min())  # root sum of squares, one axis
     given = float(np.median([max(mark.sigma_mm) for mark in marks]))

@@ -54,17 +54,13 @@ _FLIP = np.diag([1.0, -1.0])  # from right and up to columns and rows
 _ALIGNMENTS = 3  # Gauss-Newton steps; the chip is already placed to within a cell
 _FEWEST = 40  # pixels needed to compare two chips
 _CHANCE_SIGMAS = 3.0  # standard deviations by which noise may enlarge a difference
-DISTURBANCE_P = (
-    0.01  # probability that writing, dust or an adjacent object imitates or hides a difference between marks
-)
+DISTURBANCE_P = 0.01  # probability that writing, dust or another object imitates or hides a difference between marks
 _A_CHARACTER = 1.4  # log-odds of an orientation for each legible character more than in another one
 # Log-odds that a line lies where the camera writes rather than by chance, among four sides with two directions. On
 # seven real frames none of 29 lines with a title field lay elsewhere, and other words (counted by frames, since a
 # stamp may have several) on none of the seven; numbers may be written by hand at any side.
 _A_FIELD, _A_WORD, _A_NUMBER = 6.2, 4.8, 3.6
-_MISLEADING_TEXT_P = (
-    1 / 3000
-)  # probability of misleading text: of 3000 readings with a lead of 3 characters none was wrong
+_MISLEADING_TEXT_P = 1 / 3000  # of 3000 readings with a lead of 3 characters none was wrong
 _LEAST_RATIO = 1.5  # least ratio of legible characters to those of any other orientation
 _DIRECTIONS: Mapping[Side, tuple[int, int]] = {"left": (-1, 0), "right": (1, 0), "top": (0, 1), "bottom": (0, -1)}
 

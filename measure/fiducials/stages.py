@@ -71,10 +71,8 @@ _SLIGHT = (-0.005, 0.005, -0.01, 0.01)  # relative stretches for faint marks, se
 _STRETCH = 3 * AFFINITY_SIGMA  # relative error of a given pitch, where marks are too faint to correct it
 _CRITERIA = 3  # by which a false frame may be as good: response heights, misfit, and misfit under a stretch
 _STRETCHES = np.linspace(-0.03, 0.03, 13)  # relative, of non-square pixels; a step moves marks within narrow bounds
-_RARE_FRAMES, _FREQUENT_FRAMES = (
-    1e-3,
-    1e6,
-)  # expected false frames between which full resolution may change the decision
+# Expected numbers of false frames between which full resolution may change the decision.
+_RARE_FRAMES, _FREQUENT_FRAMES = 1e-3, 1e6
 _MOST_COUNTED = 3  # marks at most to whose false-alarm rates the share at full resolution applies
 _APART = 2.0  # in search radii: beyond the response of a mark itself
 _FREE = 2  # marks that a similarity fits wherever they lie

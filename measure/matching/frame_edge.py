@@ -202,7 +202,7 @@ def _find_edge(course: _Course, extent: tuple[float, float], search_px: float, p
         return None
     offset, slope = _straightest(near * polarity, middle, half)
     profiles, _ = course.profiles(middle, offset + slope * middle, share, _ABOUT_PX)
-    steps = _Steps.fitted(profiles, Coding(None, course.scan.tone, course.scan.full_scale_dn))
+    steps = _Steps.fitted(profiles, Coding(course.scan.tone, course.scan.full_scale_dn))
     good = np.abs(steps.place) < _samples(profiles)[-1] - _RIM_PX
     good &= steps.stored_contrast * polarity > FAINT * course.scan.full_scale_dn
     good &= np.abs(steps.contrast) > _LEAST_SNR * steps.noise

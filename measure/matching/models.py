@@ -63,7 +63,7 @@ class MatchOptions:
     plain_px : distance beyond which grey values must not vary much more than the nearer ones, else the match fails.
     damage_rounds : rounds of detecting and masking damage and readjusting; 0: damage stays in.
     max_shift_px : largest distance from the initial place.
-    tells_sharpening : estimate sharpening even if the scan is not known to be sharpened.
+    estimate_sharpening : whether to estimate sharpening even if the scan is not known to be sharpened.
 
     Raises
     ------

@@ -36,13 +36,8 @@ _SCALE_ROUNDS = 8  # iterations; each leaves at most two fifths of the error
 
 @dataclass(frozen=True, eq=False)
 class Coding:
-    """Relation of a window's light to the stored grey values.
+    """Relation of light to stored grey values. tone: tone curve of the scan; full_scale_dn: its largest grey value."""
 
-    stored: (height, width) grey values, None where the light is a mixture of channels; tone: tone curve of the scan;
-    full_scale_dn: its largest grey value.
-    """
-
-    stored: NDArray[np.floating] | None
     tone: Tone = LINEAR
     full_scale_dn: float = 65535.0
 
@@ -75,7 +70,7 @@ class ScanWindow:
     valid : (height, width) mask of the valid pixels; None: all.
     clipped : (height, width) pixels at an end of the scanner's range, from `clipped_ends`; None: none.
     is_lossy : whether the scan was compressed with loss.
-    coded : relation of light to stored grey values; None: grey holds the stored values.
+    coding : relation of light to stored grey values.
     """
 
     grey: NDArray[np.floating]
@@ -83,17 +78,13 @@ class ScanWindow:
     valid: Mask | None = None
     clipped: ClippedEnds | None = None
     is_lossy: bool = False
-    coded: Coding | None = None
+    coding: Coding = Coding()
 
     @property
     def usable(self) -> Mask:
         """(height, width) mask of the valid, finite pixels."""
         known = np.asarray(np.isfinite(self.grey))
         return known if self.valid is None else known & self.valid
-
-    @property
-    def coding(self) -> Coding:
-        return self.coded or Coding(self.grey)
 
     @property
     def ends(self) -> ClippedEnds:
@@ -105,15 +96,14 @@ class ScanWindow:
 
     def part(self, rows: slice, cols: slice) -> "ScanWindow":
         """Crop to the given rows and columns."""
-        coding, (col0, row0) = self.coding, self.origin_px
-        stored = None if coding.stored is None else coding.stored[rows, cols]
+        col0, row0 = self.origin_px
         return ScanWindow(
             self.grey[rows, cols],
             (col0 + cols.start, row0 + rows.start),
             self.usable[rows, cols],
             self.ends[rows, cols],
             self.is_lossy,
-            replace(coding, stored=stored),
+            self.coding,
         )
 
 
@@ -123,9 +113,8 @@ def read_window(scan: Scan, place_px: tuple[int, int, int, int], weights: Sequen
     col0, row0, _, _ = place_px
     samples, grey = scan.samples(*place_px), scan.light(*place_px, weights).astype(float)
     inside = scan.inside(*place_px, is_read=True)
-    stored = grey if scan.tone.is_identity else scan.window(*place_px, weights) if scan.channels == 1 else None
     ends = clipped_ends(samples, scan.full_scale_dn, weights)
-    return ScanWindow(grey, (col0, row0), inside, ends, scan.is_lossy, Coding(stored, scan.tone, scan.full_scale_dn))
+    return ScanWindow(grey, (col0, row0), inside, ends, scan.is_lossy, Coding(scan.tone, scan.full_scale_dn))
 
 
 def pixels_beyond_edge(window: NDArray[np.floating], mark: Mark, pixel_from_mark: Array) -> Mask:

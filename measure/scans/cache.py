@@ -37,7 +37,7 @@ class Segments(ABC):
     channels : 1 (grey) or 3 (red, green, blue).
     full_scale_dn : largest value.
     sample_bytes : 1 or 2.
-    rounding_step_dn : quantisation step of coarse detail by lossy compression; 0 without any.
+    quantisation_step_dn : of coarse detail by lossy compression; 0 without any.
     first_block_px : column and row, 0 to 7, at which the first whole block of a JPEG compression begins.
     origin_px : column and row of the first pixel in the picture of the file.
     lost : undecodable parts of the segments read so far. Their samples are set to half of the full scale, so that

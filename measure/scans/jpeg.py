@@ -72,10 +72,10 @@ UNKNOWN_DN = 15.0  # step assumed if a file has no tables: that of quality 50, b
 _INKS = 4  # components
 _EXPOSURE = ("FocalLength", "FNumber", "ExposureTime", "ISOSpeedRatings")  # Exif tags of a digital camera
 _LONGEST_NAME = 60
-_COARSE = 15  # first coefficients in the order of the table: up to two periods in a block, as in blurred edges
+_PERIODS = 5  # limit of u + v of the coarser coefficients (u, v): up to two periods in a block, as in blurred edges
+_COARSE = _PERIODS * (_PERIODS + 1) // 2  # their number: the first ones in the order of the table
 
 BLOCK_PX = 8  # a side of a block (ITU-T T.81)
-_PERIODS = 5  # limit of u + v of the same coefficients (u, v)
 _STEPS_DN = np.arange(2, 51)  # a step of 1 changes nothing; 50 is that of quality 15
 _BIN_DN = 0.25  # of coefficients: a tenth of the coarser steps
 _LARGEST_DN = 150.0  # largest coefficient used: three times the largest step
@@ -378,7 +378,7 @@ def covariances_of_rounding(
     influences : (n, 2, height, width) derivatives of n estimates by their pixels.
     pictures : (n, height, width) grey values.
     origins_px : (n, 2) column and row of the first pixel, from a place where a block begins.
-    rounding_step_dn : mean step of coarse detail.
+    quantisation_step_dn : mean step of coarse detail.
 
     Returns
     -------

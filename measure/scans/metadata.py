@@ -26,7 +26,7 @@ DECODING_ERRORS = (
     struct.error,
     TiffFileError,
 )
-MOST_PIXELS = 4_000_000_000  # 63,000 px a side: film of 23 cm at 4 um
+MOST_PIXELS = 4_000_000_000  # 63,000 px a side: film of 23 cm at 4 µm
 MOST_PER_BYTE = 1000  # decoded bytes per stored byte: the limit of deflate; film grain allows ten
 ALWAYS_BYTES = 128 << 20  # decoded size that is always allowed: a synthetic image compresses to almost nothing
 JPEG_COMPRESSIONS = (6, 7, 34892, 33007)  # of TIFF

@@ -187,7 +187,7 @@ def open_tiff(path: Path, max_pixels: int | None) -> OpenedPicture:
         has_rows_in_order = page.is_contiguous and not page.is_tiled and page.predictor == 1 and page.fillorder == 1
         is_raw = has_rows_in_order and (page.planarconfig == 1 or page.samplesperpixel == 1)
         kind = RawRows if is_raw else TiffSegments
-        segments: Segments = kind(file, page, path, radiometry, _page_rounding_step_dn(file, page))
+        segments: Segments = kind(file, page, path, radiometry, _page_quantisation_step_dn(file, page))
         overviews = _overviews(file, page, path) if isinstance(path, Address) else ()
         orientation = orientation_tag(page)
         notes = (*orientation_notes(orientation), *_band_notes(page, radiometry))
@@ -329,7 +329,7 @@ def _check_extent(page: TiffPage, path: Path, taken: list[Extent]) -> None:
             )
 
 
-def _page_rounding_step_dn(file: TiffFile, page: TiffPage) -> float:
+def _page_quantisation_step_dn(file: TiffFile, page: TiffPage) -> float:
     """Quantisation step of a page compressed as JPEG, else 0. Its tables are in a tag, or at the beginning of every
     tile or strip."""
     if page.compression not in JPEG_COMPRESSIONS:

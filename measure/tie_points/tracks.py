@@ -103,7 +103,8 @@ def verify_pairs(
         first, second = (
             frames[k].camera_px(features[k].places_px[own]) for k, own in zip((i, j), pairs.T, strict=True)
         )
-        shared[i, j] = pairs[epipolar_inliers(first, second, _AGREE_PX * features[i].reduction)]
+        _, inliers = _epipolar_geometry(first, second, _AGREE_PX * features[i].reduction)
+        shared[i, j] = pairs[inliers] if np.count_nonzero(inliers) >= FEWEST_PAIRS else pairs[:0]
     return shared
 
 
@@ -224,13 +225,6 @@ def tracks_of_pairs(shared: Shared) -> list[Track]:
         members[int(group[place])].append((frame, feature))
     tracks = (dict(own) for own in members.values() if len({frame for frame, _ in own}) == len(own))
     return sorted(tracks, key=lambda track: sorted(track.items()))
-
-
-def epipolar_inliers(first: Array, second: Array, tolerance: float) -> Mask:
-    """Mask of the pairs of points (n, 2) that satisfy one epipolar geometry within a tolerance, in the points' unit. No
-    pair passes where there are too few inliers."""
-    _, inside = _epipolar_geometry(first, second, tolerance)
-    return inside if np.count_nonzero(inside) >= FEWEST_PAIRS else np.zeros(len(first), dtype=bool)
 
 
 def epipolar_outliers(first: Array, second: Array, tolerance: float) -> Mask:

@@ -316,7 +316,7 @@ class Tone:
 
     def __repr__(self) -> str:
         value, sigma = self.equivalent_power(0.1, 0.9)
-        return f"Tone(gamma {value:.2f} +- {sigma:.2f}: {self.source})"
+        return f"Tone(gamma {value:.2f} ± {sigma:.2f}: {self.source})"
 
 
 def _log_determinant(variance: float, each: Sequence[ToneInformation]) -> float:
