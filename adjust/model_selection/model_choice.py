@@ -497,11 +497,13 @@ def verdict(given: Model, chosen: Candidate | None) -> str:
     if chosen.redundancy <= 0:
         return text
     low, high = (float(np.sqrt(chdtri(chosen.redundancy, above) / chosen.redundancy)) for above in (0.995, 0.005))
-    if not low <= chosen.sigma0 <= high:
+    if chosen.sigma0 > high:
         text += (
-            f" Its sigma0 of {chosen.sigma0:.2f} is not what the given standard deviations allow, {low:.2f} to "
-            f"{high:.2f}: they are not right, or no candidate is."
+            f" Its sigma0 of {chosen.sigma0:.3f} is above {high:.3f}, which the given standard deviations allow: they "
+            "are too small, or no candidate is right."
         )
+    elif chosen.sigma0 < low:
+        text += f" Its sigma0 of {chosen.sigma0:.3f} is below {low:.3f}: the given standard deviations are too large."
     return text
 
 

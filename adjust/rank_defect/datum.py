@@ -84,6 +84,8 @@ def minimal_datum(problem: Problem) -> Indices:
     usable = positions[free & (rays[positions[:, 0]] >= 2)]
     if len(usable) == 0:
         return np.empty(0, dtype=np.intp)
+    given = usable[~np.isnan(problem.unknowns.given[usable]).any(axis=1)]
+    usable = given if len(given) >= 3 else usable
     plan = state.values[usable[:, :2]]
     a = int(np.argmax(((plan - plan.mean(axis=0)) ** 2).sum(axis=1)))
     b = int(np.argmax(((plan - plan[a]) ** 2).sum(axis=1)))

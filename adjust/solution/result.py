@@ -429,7 +429,9 @@ def settle_datum(problem: Problem, options: Options) -> Problem:
     if options.datum_coordinates:
         unknowns = unknowns.fixed_as_given(datum.chosen_coordinates(problem, options.datum_coordinates))
     elif options.datum != "control":
-        unknowns = unknowns.fixed(datum.minimal_datum(problem))
+        chosen = datum.minimal_datum(problem)
+        start = datum.centered(problem, problem.start(), chosen).values
+        unknowns = replace(unknowns, start=start).fixed_as_given(chosen)
     settled = replace(problem, unknowns=unknowns)
     is_bent = not problem.network.line_of_sight.is_straight
     if is_bent and datum.object_datum(settled, settled.start()).free.shape[1] > 0:

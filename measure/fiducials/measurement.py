@@ -77,6 +77,11 @@ def measure_fiducials(
     if scan.is_lost:
         damage = Reason(f"not found: {scan.damage}", Code.DAMAGED_FILE)
         return FrameMeasurement(scan.name, _absent_marks(layout, damage))
+    beyond = [click for click in options.clicks if not scan.contains(click.col_px, click.row_px)]
+    if beyond:
+        inside = tuple(click for click in options.clicks if click not in beyond)
+        measured = measure_fiducials(scan, layout, pitch_um, replace(options, clicks=inside))
+        return replace(measured, problems=(*map(_beyond, beyond), *measured.problems))
     clicked = clicked_frame(scan, layout, pitch_um, options) if options.clicks else None
     if clicked is None:
         return _place_clicked_marks(_search_frame(scan, layout, pitch_um, options), options.clicks)
@@ -88,6 +93,14 @@ def measure_fiducials(
         return shown
     marks = tuple(mark.reject(contradiction) for mark in shown.marks)
     return replace(shown, marks=marks, problems=(contradiction.reword(f"{contradiction}."), *shown.problems))
+
+
+def _beyond(click: Click) -> Reason:
+    return Reason(
+        f"The place to which a person pointed for mark {click.point} is outside of the scan, and not used. Point to "
+        "the mark again.",
+        Code.OUTSIDE,
+    )
 
 
 def _search_frame(

@@ -198,6 +198,10 @@ class Scan:
         part = self.path.window if isinstance(self.path, ScanPart) else None
         return part or (0, 0, self.width_px, self.height_px)
 
+    def contains(self, col_px: float, row_px: float) -> bool:
+        """Whether a place lies within the pixels of the scan."""
+        return -0.5 <= col_px <= self.width_px - 0.5 and -0.5 <= row_px <= self.height_px - 0.5
+
     def inside(self, col0: int, row0: int, width: int, height: int, is_read: bool = False) -> NDArray[np.bool_]:
         """(height, width) mask of the pixels of a window that lie in the scan and could be decoded. is_read: the window
         has been read before, so that its losses are known."""

@@ -135,10 +135,10 @@ def convert(
     done = run_convert(file, out_dir, ConvertOptions(family, r0_mm, named, camera))
     files = f"{out_dir}: {counted(len(done.files), 'file')}"
     shared.show(as_json, done.as_json, lambda _: shared.say(*done.lines(), files))
-    line = f'camera = "{out_dir / "camera.toml"}"'
+    line = f'camera = "{out_dir / "camera.toml"}" in project.toml'
     if "camera.toml" not in done.files:
-        line = f'calibration = "{out_dir / "adjustment.json"}" under [sigma]'
-    shared.print_next(as_json, f"{line} in project.toml, then reseau run")
+        line = f'calibration = "{out_dir / "adjustment.json"}" under [sigma] in the camera file'
+    shared.print_next(as_json, f"{line}, then reseau run")
     return shared.LOOK if done.misfit_um > misfit_um else shared.DONE
 
 

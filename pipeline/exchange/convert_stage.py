@@ -153,14 +153,30 @@ def _convert(
     return found, (sentence, f"Fitted: c, x0', y0' and {listed(found.estimated) or 'no parameter'}.")
 
 
+def _convert_over_frame(
+    camera: CameraRecord, observed: Array, lens: Lens, sigmas: Array, options: ConvertOptions
+) -> tuple[ConvertedLens, tuple[str, ...]]:
+    """Convert an adjusted lens over its frame; where that is unknown, or the converted lens would fold the image over
+    in a part of it, over the extent of the observations (n, 2)."""
+    extent_mm = np.array([observed.min(axis=0), observed.max(axis=0)])
+    reach, beyond = camera.lens_known, tuple[str, ...]()
+    if reach is not None and reach.frame_mm is not None:
+        try:
+            return _convert(lens, sigmas, np.array(reach.frame_mm), options)
+        except InputError:
+            beyond = ("That is the extent of the observations: in the frame beyond it the image would be folded over.",)
+    found, sentences = _convert(lens, sigmas, extent_mm, options)
+    return found, (*sentences, *beyond)
+
+
 def _converted_adjustment(path: Path, options: ConvertOptions) -> Conversion:
     """Convert one camera's lens within the whole adjustment.json and adjustment.npz."""
     content, covariance = read_adjustment(path), read_own_covariance(path)
     name, given = calibrated_lens(path, content, options.camera)
     known = np.sqrt(np.diag(covariance.select(_parameters(name, given)[3:])))
-    places = observed_mm(path, content, name)
-    corners_mm = np.array([places.min(axis=0), places.max(axis=0)])
-    lens, sentences = _convert(given, known, corners_mm, options)
+    lens, sentences = _convert_over_frame(
+        content.cameras[name], observed_mm(path, content, name), given, known, options
+    )
     moved = _moved_covariance(covariance, name, given, lens)
     keys = _parameters(name, lens.lens)
     model, sigmas = (np.sqrt(np.diag(select(keys))) for select in (moved.select, moved.select_larger))

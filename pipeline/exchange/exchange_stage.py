@@ -172,9 +172,10 @@ def run_import(format: str, paths: Sequence[Path], folder: Path, options: Import
 
 def _unknown_notes(cameras: Sequence[CameraFile]) -> Iterator[str]:
     """Notes on what the camera files assume because the other program's files do not contain it."""
-    if held := [camera.name for camera in cameras if camera.principal_distance_sigma_mm == 0.0]:
+    held = dict.fromkeys(camera.name for camera in cameras if camera.principal_distance_sigma_mm == 0.0)
+    if held:
         yield (
-            f"{listed(held)}: the files give no standard deviations. The calibration is held fixed; give [sigma] in "
+            f"{listed([*held])}: the files give no standard deviations. The calibration is held fixed; give [sigma] in "
             "the camera file if it is to be adjusted."
         )
     for camera in cameras:

@@ -446,6 +446,14 @@ class Session:
             mark = view.mark(one.point, one.subject[2]) if one.point else None
         except KeyError as error:
             raise InputError(f"there is no image or mark {error.args[0]!r}.") from None
+        size = (view.scan.width_px, view.scan.height_px)
+        if one.decision is decisions_file.DecisionKind.PLACE and not all(
+            px is not None and -0.5 <= px <= side - 0.5 for px, side in zip((one.col_px, one.row_px), size, strict=True)
+        ):
+            raise InputError(
+                f"{one.image}, {one.point}: column {one.col_px:g}, row {one.row_px:g} is outside of the scan of "
+                f"{size[0]} x {size[1]} px. Click within it."
+            )
         if one.decision in (decisions_file.DecisionKind.ACCEPT, decisions_file.DecisionKind.REJECT) and (
             mark is None or mark.covariance is None
         ):

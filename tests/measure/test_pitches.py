@@ -164,6 +164,20 @@ def test_a_click_where_nothing_is_matched_counts_as_well_as_one_points() -> None
     np.testing.assert_array_equal(mark.covariance.parts[Cause.CLICK], CLICK_SIGMA_PX**2 * np.eye(2))
 
 
+def test_a_click_outside_of_the_scan_is_named_and_moves_nothing() -> None:
+    """It was an observation, and the camera's other frames were blamed."""
+    matrix = draw.pixel_from_camera("0")
+    grey = draw.frame_picture(draw.ALIKE, matrix)
+    options = FiducialOptions(pose="0")
+    expected = draw.measure_grey(grey, draw.ALIKE, options)
+    result = draw.measure_grey(grey, draw.ALIKE, replace(options, clicks=(Click("4", 99999.0, 5.0),)))
+    assert [(mark.status, *center(mark)) for mark in result.marks] == [
+        (mark.status, *center(mark)) for mark in expected.marks
+    ]
+    (problem,) = result.problems
+    assert "pointed for mark 4 is outside of the scan" in problem
+
+
 def test_a_click_says_which_of_two_marks_is_meant() -> None:
     """A mark as good as any lies a millimetre and a half from where the others put it."""
     matrix = draw.pixel_from_camera("0")

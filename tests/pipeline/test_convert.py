@@ -62,7 +62,9 @@ def test_an_adjustment_keeps_its_covariance(tmp_path: Path, printed: Printed) ->
     command("adjust", project)
     first = tmp_path / "out" / "adjustment.json"
     there, back = tmp_path / "brown", tmp_path / "back"
-    assert f'calibration = "{there / "adjustment.json"}" under [sigma]' in printed("convert", first, "brown", there)
+    assert f'calibration = "{there / "adjustment.json"}" under [sigma] in the camera file' in printed(
+        "convert", first, "brown", there
+    )
     assert command("convert", there / "adjustment.json", "australis", back) == DONE
     before, after = (read_adjustment(path).cameras["L"] for path in (first, back / "adjustment.json"))
     for name in ("k1", "k2", "p1", "p2", "b1", "b2"):
@@ -88,7 +90,7 @@ def test_the_larger_covariance_is_converted_saved_and_used(tmp_path: Path, print
     xy_mm, images = network.observations.xy_mm, [int(image[1:]) for image in network.observations.image]
     unlike = 1e-5 * np.random.default_rng(8).normal(size=len(network.images))[images, None]
     observed = replace(network.observations, xy_mm=xy_mm * (1.0 + unlike * (xy_mm**2).sum(axis=1, keepdims=True)))
-    project = write_network_project(replace(network, observations=observed), tmp_path)
+    project = write_network_project(replace(network, observations=observed), tmp_path, "frame_mm = [40.0, 27.0]")
     project.write_text(project.read_text() + 'unmodelled = "estimate"\n')
     command("adjust", project)
     first, out = tmp_path / "out" / "adjustment.json", tmp_path / "brown"
@@ -100,6 +102,7 @@ def test_the_larger_covariance_is_converted_saved_and_used(tmp_path: Path, print
     quantities = written["principal_distance_mm"], *written["principal_point_mm"].values(), written["distortion"]["k1"]
     clusters = np.sqrt(np.diag(present(known.clusters).select(keys[:4])))
     assert [each["sigma_clusters"] for each in quantities] == pytest.approx(clusters)
+    assert "over 40 x 27 mm is rounding" in " ".join(printed("convert", first, "brown", out).split())
     values = json.loads(printed("convert", first, "brown", out, "--json"))["values"]
     assert [values[name]["sigma"] for name in names] == pytest.approx(sigmas, rel=1e-6)
     converted = read_covariance(out / "adjustment.json")

@@ -106,6 +106,10 @@ def test_images_and_marks_are_names_and_never_paths(path: str, server: review.Se
         ({"image": review.BARE, "point": "3", "kind": "fiducial", "decision": "accept"}, "nothing was measured"),
         ({"image": review.GOOD, "point": "1", "kind": "fiducial", "decision": "keep"}, "must be one of accept"),
         ({"image": review.GOOD, "decision": "pose", "pose": "45"}, "pose: must be one of 0"),
+        (
+            {"image": review.GOOD, "point": "1", "kind": "fiducial", "decision": "place", "col_px": 99999, "row_px": 5},
+            "column 99999, row 5 is outside of the scan of",
+        ),
         ("accept", "dictionary"),
     ],
 )
