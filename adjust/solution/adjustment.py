@@ -549,7 +549,8 @@ def _reason(first: Adjustment, last: Adjustment, frames: Sequence[str]) -> str:
     orientation = "a wrong orientation in images.csv, " if is_observed else ""
     return (
         f"all marks of {who} contradict the other images, which agree without them{times}. Possible are {orientation}"
-        "another size, pitch, zoom or camera than given, a crop, another print of the board, or wrong point numbers."
+        "another size, pitch, zoom or camera than given, a crop, another print of the board, wrong point numbers, or "
+        "two frames under one name."
     )
 
 

@@ -61,7 +61,8 @@ ENDING = ("groups", "distances", "affinities")  # after which nothing else is so
 OF_IMAGES = ("radial", "decentering", "bow", "pixels", "shear", "drift", "jump", "interior", "groups", "distances")
 OF_POINTS = ("board", "disks", "point")
 # Kinds of hypotheses with unknowns for every image, and the simpler ones that may explain as much.
-GENERAL = {"distances": ("drift", "groups"), "affinities": OF_IMAGES + OF_POINTS}
+GENERAL = {"distances": ("drift", "groups"), "affinities": OF_IMAGES + OF_POINTS, "film": ("pixels",)}
+GIVEN_LOOSELY = ("datum", "interior")  # groups of priors
 FEWEST = 30  # coordinates needed to test the distribution of residuals
 NOISE_LEVEL = 0.001  # significance level of each test of the noise hypothesis
 NEIGHBOURS = 8  # nearest neighbours searched for one in the same, or in another, image
@@ -441,9 +442,11 @@ def _neighbour_products(run: Run, checked: Mask, w: Array, images: Indices) -> I
 
 
 def _groups_agree(run: Run) -> bool:
-    """Whether every group of observations agrees with its standard deviations in a two-sided test."""
+    """Whether every group of observations agrees with its standard deviations, in a two-sided test but for values that
+    are given with larger ones than they need."""
     for name in np.unique(run.units.groups):
         vpv, freedom = run.group_sums((run.units.groups == name) & run.weighting.used)
-        if freedom > 1.0 and min(chdtr(freedom, vpv), chdtrc(freedom, vpv)) < NOISE_LEVEL:
+        below = 1.0 if name in GIVEN_LOOSELY else chdtr(freedom, vpv)
+        if freedom > 1.0 and min(below, chdtrc(freedom, vpv)) < NOISE_LEVEL:
             return False
     return True

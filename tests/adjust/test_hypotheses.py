@@ -442,6 +442,28 @@ def test_standard_deviations_of_points_in_m_for_mm_are_named_with_the_factor() -
     assert float(words[1]) == pytest.approx(1000.0, rel=0.2)
 
 
+def test_a_loose_prior_that_is_met_well_does_not_hide_the_standard_deviations_of_points() -> None:
+    """60 gross errors had been suspected, since c, x0 and y0 lay nearer to what was given than their sigma of 1 mm."""
+    given = faults.change_points(faults.blunder_network(2), lambda xyz: xyz, 1e-3)
+    truth = nets.Truth()
+    priors = nets.given_interior([truth.c, truth.x0, truth.y0], 5.0)
+    given = nets.set_camera(given, principal_distance_mm=priors[0], x0_mm=priors[1], y0_mm=priors[2])
+    result = adjust(given)
+    assert [each.kind for each in result.explanations] == ["noise"]
+    assert "given to the object points are too small everywhere" in result.explanations[0].cause
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_pixels_that_are_not_square_are_no_films_deformed_each_in_its_own_way(seed: int) -> None:
+    rng, truth = np.random.default_rng([7, seed]), nets.Truth(distortion={"k3": 2e-8, "p1": 2e-8})
+    places = nets.field_points(rng, 25)
+    made, _ = nets.simulated(rng, truth, "similarity", places, fiducial_sigma=0.01, point_sigma=0.05)
+    stretched = nets.set_observations(made, xy_mm=made.observations.xy_mm * [1.0001, 1.0])
+    (found,) = adjust(stretched).explanations
+    assert found.kind == "pixels"
+    assert float(found.cause.split("width is ")[1].split(" ±")[0]) == pytest.approx(1.0 / 1.0001, abs=4e-5)
+
+
 @pytest.mark.parametrize("axis", [0, 2])
 def test_points_in_another_datum_than_observed_orientations_are_named(axis: int) -> None:
     """Sheared points and too small standard deviations were told, or kappa of every image called suspect."""
