@@ -430,7 +430,7 @@ def settle_datum(problem: Problem, options: Options) -> Problem:
         unknowns = unknowns.fixed_as_given(datum.chosen_coordinates(problem, options.datum_coordinates))
     elif options.datum != "control":
         chosen = datum.minimal_datum(problem)
-        start = datum.centered(problem, problem.start(), chosen).values
+        start = datum.center_datum(problem, problem.start(), chosen).values
         unknowns = replace(unknowns, start=start).fixed_as_given(chosen)
     settled = replace(problem, unknowns=unknowns)
     is_bent = not problem.network.line_of_sight.is_straight
