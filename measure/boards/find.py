@@ -407,7 +407,7 @@ def _find_markers(picture: Bytes, spec: ArucoSpec | CharucoSpec) -> FoundBoard:
         return upright
     mirrored = find(np.ascontiguousarray(picture[:, ::-1]))
     is_mirrored = len(mirrored.corners) >= max(_PLAIN_CORNERS, len(upright.corners) + 1)
-    return mirrored.mirrored(picture.shape[1]) if is_mirrored else upright
+    return mirrored.mirror(picture.shape[1]) if is_mirrored else upright
 
 
 def recognise_board(scan: Scan) -> str:

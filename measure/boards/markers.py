@@ -46,7 +46,7 @@ class MarkerReadings:
     size_px: tuple[int, int]
     border: float
 
-    def quarter_turned(self, turns: int) -> "MarkerReadings":
+    def turn_corners(self, turns: int) -> "MarkerReadings":
         """Renumber the corners of all markers by quarter turns."""
         turned = {
             number: [np.roll(outline, turns, axis=0) for outline in places]
@@ -269,7 +269,7 @@ def _read_board(picture: Bytes, spec: Layout) -> tuple[ReadMarkers, Layout]:
     )
     best, layout = placed_markers(readings, _markers(spec)), spec
     # Programs that print AprilTags differ in which of a tag's corners is the first.
-    turned = [readings.quarter_turned(turns) for turns in range(4 if is_tag else 1)]
+    turned = [readings.turn_corners(turns) for turns in range(4 if is_tag else 1)]
     layouts: Iterator[Layout] = chain((spec,), _other_layouts(spec, readings))
     for other, read in product(layouts, turned):
         if best.agreeing == len(readings.outlines_px):

@@ -261,7 +261,7 @@ class FoundBoard:
     notes: tuple[str, ...] = ()
     is_mirrored: bool = False
 
-    def mirrored(self, width_px: int) -> "FoundBoard":
+    def mirror(self, width_px: int) -> "FoundBoard":
         """Convert to the board of the image mirrored left to right."""
         sign = np.array([-1.0, 1.0])
         corners = {

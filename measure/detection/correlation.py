@@ -48,7 +48,7 @@ class Surroundings:
         """Distance (px) up to which the background of a pixel is estimated."""
         return _MEDIAN * _mean_px(self.coarse * detail_px) // 2 + 1
 
-    def flattened(self, image: Map, detail_px: float, faint_dn: float) -> Map:
+    def flatten(self, image: Map, detail_px: float, faint_dn: float) -> Map:
         """Subtract structure much coarser than detail_px and normalise by the local contrast.
 
         A thin cross then gives the same response on image texture as on a uniform background. Contrasts of faint_dn or

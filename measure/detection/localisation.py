@@ -105,7 +105,7 @@ class _PeakSearch:
         rim = surroundings.ground_reach_px(finest_px)
         wide = mark_window(mark, reduced, search_px + spare + 2 + rim)
         window = scan.reduced_window(reduction, *wide, expected.weights)
-        flattened = surroundings.flattened(window, finest_px, scan.full_scale_dn * FAINT)
+        flattened = surroundings.flatten(window, finest_px, scan.full_scale_dn * FAINT)
         self._flat = expected.polarity * flattened[rim:-rim, rim:-rim]
         self._pattern, self._counts = surroundings.pattern(template, finest_px, self._flat)
         response = correlation(self._flat, self._pattern, self._counts)

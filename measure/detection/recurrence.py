@@ -45,7 +45,7 @@ def resample_square(scan: Scan, pixel_from_camera: Array, xy_mm: Array, size_mm:
     fine = cv2.GaussianBlur(chip.grey, (0, 0), max(0.5 * pitch_mm * linear_scale(linear), 0.3))
     chip = replace(chip, grey=np.asarray(fine, float))
     sampled = resample_chip(chip, place, 2 * half + 1, 1000 * pitch_mm, order=1).astype(np.float32)
-    return WIDE.flattened(sampled, _DETAIL, scan.full_scale_dn * FAINT)
+    return WIDE.flatten(sampled, _DETAIL, scan.full_scale_dn * FAINT)
 
 
 def recurrence(reference: Window, others: Sequence[Window], size_mm: float) -> Recurrence:

@@ -221,7 +221,7 @@ class CorrelationMaps(Mapping[Key, Map]):
         for number, channel in enumerate(self._channels):
             # Kinds of equal detail share the flattened image, kinds with equal masks its variation under them.
             key = self._own, number, detail
-            flat = get(key, partial(self._surroundings.flattened, channel, detail, self._faint_dn))
+            flat = get(key, partial(self._surroundings.flatten, channel, detail, self._faint_dn))
             chip, mask = self._surroundings.pattern(image, detail, flat)
             varied = get((key, mask.tobytes()), partial(variation, flat, mask))
             response = correlation(flat, chip, mask, varied)

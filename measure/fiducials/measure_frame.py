@@ -108,7 +108,7 @@ _STRAINED = 1 / 3  # fraction of a mark's standard deviation: a larger strain er
 _BETTER_KNOWN = 2 / 3  # ratio of the standard deviations of rotation and scale after and before a refit for another one
 _TONE_ROUNDS = 5  # largest number of refits with an improved tone curve
 _OTHER_STARTS, _AGREED = (2.2, 1.0), 0.1  # gammas of further initial curves; disagreement up to which none is tried
-_TELLING = 8  # most significant marks, refitted until widths, sharpening and tone curve are settled: more cost time
+_MOST_SIGNIFICANT = 8  # marks refitted until widths, sharpening and tone curve are settled: more cost time
 _SHARED_ROUNDS = 8  # largest number of refits with improved widths and sharpening
 _UNCHECKED = 3  # marks, which an affine transformation fits without residuals
 _REFIT_PX = 1.5  # search range around a mark that was fitted already
@@ -631,7 +631,7 @@ def fit_lines_and_sharpening(frame: Frame, fewest: int = 0) -> Frame:
             found = estimate_sharpening(before, list(scores.values()), len(frame.scan.tone.mean)) or Sharpening()
         if drawn is frame and found.is_close_to(before):
             break
-        significant = significant[:_TELLING]
+        significant = significant[:_MOST_SIGNIFICANT]
         if before and last:  # of the others only the detail is fitted, which is independent of it
             significant = [index for index in significant if index in scores] or significant
         last, before = (before, found), found.accelerate(before, last)

@@ -56,7 +56,7 @@ class Rendering:
         """Laplacian, twice the derivative with respect to the blur's variance."""
         return np.asarray(self.by_col_col + self.by_row_row)
 
-    def bent(self, change: Array, center_px: Array, variance_px2: float) -> "Rendering":
+    def deform(self, change: Array, center_px: Array, variance_px2: float) -> "Rendering":
         """Deform the image by a second-order Taylor series: the mark's linear part is multiplied by (I + change).
 
         The second derivatives are kept. variance_px2: of blur and pixel, which are not deformed with the mark.

@@ -123,7 +123,7 @@ def adjust_picture(shared: SharedPicture, stack: Array, steady: Mask) -> SharedP
     sharpest = float((found + _SURELY * np.array([fit.blur_sigma_px2 for fit in fits])).min())
     variances = np.maximum(found - sharpest, 0.0)
     together = _JointAdjustment(shared.image, variances, weights, steady)
-    image, more = together.solved(np.array([fit.levelled for fit in fits]))
+    image, more = together.solve(np.array([fit.levelled for fit in fits]))
     moves = np.clip(-more[:, [_COL, _ROW]], -_LONGEST_PX, _LONGEST_PX)
     return SharedPicture(
         image,
@@ -230,7 +230,7 @@ class _JointAdjustment:
         self.held = float(np.sqrt(_HELD * np.median(weights.mean(axis=(1, 2)))))
         self.scale = 1 / np.sqrt(weights.sum(axis=0) + self.held**2)
 
-    def solved(self, levelled: Array) -> tuple[Array, Array]:
+    def solve(self, levelled: Array) -> tuple[Array, Array]:
         """Solve for the shared image and the corrections (n, 5) of the images' unknowns. levelled: (n, side, side)."""
         wanted = (self.roots * (levelled - self.designs[:, _GAIN])).ravel()
         rest = self.image.size + _BLUR
@@ -238,15 +238,15 @@ class _JointAdjustment:
         operator = LinearOperator(shape, matvec=self._forward, rmatvec=self._adjoint, dtype=float)
         wanted = np.concatenate([wanted, np.zeros(rest)])
         found = lsmr(operator, wanted, atol=_TOLERANCE, btol=_TOLERANCE, maxiter=_ITERATIONS)[0]
-        image, factors = self._parted(found)
+        image, factors = self._split(found)
         return self.image + self.scale * image, factors / self.lengths
 
-    def _parted(self, unknowns: Array) -> tuple[Array, Array]:
+    def _split(self, unknowns: Array) -> tuple[Array, Array]:
         return unknowns[: self.image.size].reshape(self.image.shape), unknowns[self.image.size :].reshape(-1, _BLUR + 1)
 
     def _forward(self, unknowns: Array) -> Array:
         """Product of the design matrix with the unknowns: images, prior of the shared image, and sums."""
-        image, factors = self._parted(unknowns)
+        image, factors = self._split(unknowns)
         change = self.scale * image
         pictures = idctn(self.transfers * _cosines(change), axes=(1, 2), norm="ortho")
         pictures = self.roots * pictures + np.einsum("nk,nkij->nij", factors, self.columns)

@@ -143,7 +143,7 @@ class _Steps:
     design: Array
 
     @classmethod
-    def fitted(cls, grey: Array, coding: Coding) -> "_Steps":
+    def fit(cls, grey: Array, coding: Coding) -> "_Steps":
         """Fit a step to every profile (n, samples) of light by Gauss-Newton. coding: of the scan."""
         s = _samples(grey)
         place, blur = np.zeros((len(grey), 1)), np.full((len(grey), 1), _START_BLUR_PX)
@@ -202,7 +202,7 @@ def _find_edge(course: _Course, extent: tuple[float, float], search_px: float, p
         return None
     offset, slope = _straightest(near * polarity, middle, half)
     profiles, _ = course.profiles(middle, offset + slope * middle, share, _ABOUT_PX)
-    steps = _Steps.fitted(profiles, Coding(course.scan.tone, course.scan.full_scale_dn))
+    steps = _Steps.fit(profiles, Coding(course.scan.tone, course.scan.full_scale_dn))
     good = np.abs(steps.place) < _samples(profiles)[-1] - _RIM_PX
     good &= steps.stored_contrast * polarity > FAINT * course.scan.full_scale_dn
     good &= np.abs(steps.contrast) > _LEAST_SNR * steps.noise
@@ -287,7 +287,7 @@ def _intersect_edges(edges: Sequence[_Edge], unit: Array, pixel_from_mark: Array
 
 def _corner_tone(tones: Sequence[MarkTone], by_lines: Sequence[Array]) -> MarkTone:
     """Combine the edges' information for a corner. by_lines: (2, 2) derivatives of the corner by each edge's line."""
-    both = ToneInformation.pooled([each.information for each in tones])
+    both = ToneInformation.pool([each.information for each in tones])
     # Errors common to an edge (background, JPEG) make the two disagree: a variance factor allows for them.
     misfit = both.sum_of_squares - both.right_side @ np.linalg.pinv(both.matrix, hermitian=True) @ both.right_side
     more = max(float(misfit) / (both.count - len(both.right_side)), 1.0)

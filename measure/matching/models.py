@@ -384,7 +384,9 @@ class PictureModel:
         place = self.place_drawn()
         shown = render(self.mark, place, width, height, self.blur_px)
         change = self._bend()
-        return shown.bent(change, place[:, 2], self.state.variance_px2 + PIXEL_VARIANCE_PX2) if change.any() else shown
+        return (
+            shown.deform(change, place[:, 2], self.state.variance_px2 + PIXEL_VARIANCE_PX2) if change.any() else shown
+        )
 
 
 def background_planes(height: int, width: int) -> Array:

@@ -41,7 +41,7 @@ class RingCode:
         weights = 1 << np.arange(self.bits)[::-1]
         return min(int(weights @ np.roll(segments, turn)) for turn in range(self.bits))
 
-    def mirrored(self, number: int) -> int:
+    def mirror(self, number: int) -> int:
         """Number of the mirror image of a code."""
         return self.least_turn(int(f"{number:0{self.bits}b}"[::-1], 2))
 

@@ -85,7 +85,7 @@ class ToneInformation:
         return cls(np.zeros((_COUNT, _COUNT)), np.zeros(_COUNT), 0.0, 0)
 
     @classmethod
-    def pooled(cls, each: Sequence["ToneInformation"], scatter: float = 0.0) -> "ToneInformation":
+    def pool(cls, each: Sequence["ToneInformation"], scatter: float = 0.0) -> "ToneInformation":
         """Pool the information of several images on the scanner's curve.
 
         Parameters
@@ -110,7 +110,7 @@ class ToneInformation:
     @property
     def scanner_information(self) -> "ToneInformation":
         """Information on the scanner's curve, with the common variance included in the matrix."""
-        return replace(ToneInformation.pooled([self], self.common_variance), common_variance=0.0)
+        return replace(ToneInformation.pool([self], self.common_variance), common_variance=0.0)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -197,7 +197,7 @@ class Tone:
         """
         if not others:
             return self
-        sharpening = Sharpening.pooled([one.sharpening for one in others])
+        sharpening = Sharpening.pool([one.sharpening for one in others])
         return replace(self.estimate(others)[0], other_scans=(self, tuple(others)), sharpening=sharpening)
 
     def estimate(self, each: Sequence[ToneInformation]) -> tuple["Tone", float]:
@@ -239,7 +239,7 @@ class Tone:
         """
         estimates = []
         for scatter in _SCATTERS:
-            pooled = ToneInformation.pooled(each, scatter)
+            pooled = ToneInformation.pool(each, scatter)
             information, prior = pooled.scanner_information, np.linalg.inv(self.covariance)
             covariance = np.linalg.inv(prior + information.matrix)
             right_side = prior @ self.mean + information.right_side

@@ -76,7 +76,7 @@ class FrameTone:
             covariance = prior.covariance + np.outer(off, off)
             doubted = replace(prior, covariance=covariance, source=source, before=prior).replace_sharpening(sharpening)
             return cls(doubted, None, *ends, 0.0, float(off @ off), is_determined)
-        information = replace(ToneInformation.pooled(each, scatter), sharpening=sharpening)
+        information = replace(ToneInformation.pool(each, scatter), sharpening=sharpening)
         tone = replace(tone, before=prior).replace_sharpening(sharpening)
         return cls(tone, information, *ends, scatter, float(step @ step), is_determined)
 

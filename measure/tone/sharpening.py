@@ -42,7 +42,7 @@ class Sharpening:
     prior: "Sharpening | None" = field(default=None, compare=False)
 
     @classmethod
-    def pooled(cls, each: Sequence["Sharpening"]) -> "Sharpening":
+    def pool(cls, each: Sequence["Sharpening"]) -> "Sharpening":
         """Pool the sharpening of several scans of a scanner as prior of a further scan; none if most are not
         sharpened."""
         found = [one for one in each if one]

@@ -111,7 +111,7 @@ def _coded_dots(scan: Scan, coded: CodedPoints, mirrored: bool = False) -> _Code
     found, code = disk_candidates(scan, search), coded.settings.code
     assert code is not None
     read = {dot: number for dot, one in enumerate(found) if (number := read_code(scan, one, code)) is not None}
-    numbers = {dot: code.mirrored(number) if mirrored else number for dot, number in read.items()}
+    numbers = {dot: code.mirror(number) if mirrored else number for dot, number in read.items()}
     row = {id: i for i, id in enumerate(coded.ids)}
     names = {dot: coded.settings.numbers.get(number, str(number)) for dot, number in numbers.items()}
     points = {dot: row[name] for dot, name in names.items() if name in row}

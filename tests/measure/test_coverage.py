@@ -61,7 +61,7 @@ def test_a_picture_bent_by_a_series_is_that_of_the_mark_drawn_anew(name: str) ->
     mark, center, blur_px = MarkShape(MARKS[name]), np.array([20.3, 19.7]), 0.8
     for generator in ([[1, 0], [0, 1]], [[0, -1], [1, 0]], [[1, 0], [0, -1]], [[0, 1], [1, 0]]):
         change = 0.05 / 15 * np.array(generator)
-        bent = render(mark, SHEARED, 41, 41, blur_px).bent(change, center, blur_px**2 + 1 / 12)
+        bent = render(mark, SHEARED, 41, 41, blur_px).deform(change, center, blur_px**2 + 1 / 12)
         anew = render(mark, np.column_stack([(np.eye(2) + change) @ SHEARED[:, :2], center]), 41, 41, blur_px)
         np.testing.assert_allclose(bent.value, anew.value, atol=0.002)
         np.testing.assert_allclose(bent.by_col, anew.by_col, atol=0.01)

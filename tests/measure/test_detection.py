@@ -209,7 +209,7 @@ def responses_to(
     surroundings: Surroundings, grey: np.ndarray, template: np.ndarray, detail_px: float, faint_dn: float
 ) -> Map:
     """The correlation of a picture, freed of its ground, with a template."""
-    flat = surroundings.flattened(grey.astype(np.float32), detail_px, faint_dn)
+    flat = surroundings.flatten(grey.astype(np.float32), detail_px, faint_dn)
     return correlation(flat, *surroundings.pattern(template, detail_px, flat))
 
 

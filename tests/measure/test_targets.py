@@ -469,7 +469,7 @@ def test_the_published_choice_of_numbers() -> None:
 def test_a_ring_viewed_from_behind() -> None:
     code = RingCode()
     segments = np.array([0, 0, 0, 0, 0, 1, 0, 1, 1, 1, 0, 0], bool)
-    assert code.mirrored(code.number(segments[::-1])) == code.number(segments)
+    assert code.mirror(code.number(segments[::-1])) == code.number(segments)
     assert code.number(segments[::-1]) != code.number(segments)
 
 

@@ -174,7 +174,7 @@ def test_many_scans_in_jpeg_tell_the_curve_no_better_than_rounding_lets_them() -
         fit = detect_mark(scan, expected, measure.MatchOptions(linear_sigma=0.05), mark.kind.known).fit
         assert fit is not None
         assert fit.tone is not None
-        estimate = [ToneInformation.pooled([fit.tone.information] * count).scanner_information for count in (1, 16)]
+        estimate = [ToneInformation.pool([fit.tone.information] * count).scanner_information for count in (1, 16)]
         known.append([np.linalg.norm(information.matrix, 2) for information in estimate])
     (one, many), (one_rounded, many_rounded) = known
     assert many == pytest.approx(16 * one)
@@ -485,18 +485,18 @@ def test_a_sharpening_is_determined_where_it_is_better_known_than_before() -> No
     assert not Sharpening().is_determined
     assert Sharpening(0.8, 1.0, np.diag([0.5, 0.1])).is_determined
     assert not Sharpening(0.8, 1.0, np.diag([0.01, 0.25])).is_determined  # the radius as before
-    pooled = Sharpening.pooled([Sharpening(0.8, 1.0, np.diag([0.01, 0.01]))] * 3)
+    pooled = Sharpening.pool([Sharpening(0.8, 1.0, np.diag([0.01, 0.01]))] * 3)
     assert not pooled.is_determined
     assert replace(pooled, covariance=pooled.covariance / 2).is_determined
 
 
 def test_scans_of_a_scanner_say_together_how_it_sharpens() -> None:
     own = [Sharpening(amount, 1.2, np.diag([0.04, 0.01])) for amount in (1.3, 1.5, 1.7)]
-    pooled = Sharpening.pooled(own)
+    pooled = Sharpening.pool(own)
     assert pooled.amount == pytest.approx(1.5)
     assert pooled.radius_px == pytest.approx(1.2)
     assert 0.1 < np.sqrt(pooled.covariance[0, 0]) < 0.3
-    assert not Sharpening.pooled([own[0], Sharpening(), Sharpening()])  # most are not
+    assert not Sharpening.pool([own[0], Sharpening(), Sharpening()])  # most are not
     information = [replace(ToneInformation.empty(), sharpening=each) for each in own]
     known = Tone.unknown().include_information(information).sharpening
     assert known.amount == pytest.approx(1.5)
