@@ -20,9 +20,8 @@ test: lint
 test-all: lint $(DOCS)/ready
 	$(MAKE) --no-print-directory --jobs=2 types suite MARKED="study or not study"
 
-# One BLAS thread a worker: two on two cores make the small factorisations ten times slower. And byte code is kept, also
-# where the environment forbids it: every process that a test starts would compile the program anew.
-suite: export OPENBLAS_NUM_THREADS = 1
+# Byte code is kept, also where the environment forbids it: every process that a test starts would compile the program
+# anew.
 suite: export PYTHONDONTWRITEBYTECODE =
 suite: $(TESTED) $(PLAIN)/ready
 	$(BIN)/python -m pytest -n 2 --dist loadgroup $(if $(MARKED),-m "$(MARKED)")

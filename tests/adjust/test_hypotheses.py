@@ -1,7 +1,7 @@
 """What makes sigma0 too large is named, and nothing else is blamed: model, coordinates, whole networks."""
 
 import re
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -27,19 +27,15 @@ QUICK = (
     "board stretched",
     "object stretched",
     "disks of another diameter",
-    "dots of a diameter that nobody gave",
     "board bent over a diagonal",
     "focus drifts",
     "focus breathes with the distance",
     "pictures moved",
     "rows of an image jump",
-    "rows of all images jump",
     "a row of points shifted",
     "half the board shifted",
     "numbers of a third of the images one off",
-    "principal point held wrong",
     "k1 held wrong",
-    "Y in another unit",
     "Z in feet",
     "a point is elsewhere",
     "mm for m, stations in m",
@@ -122,7 +118,7 @@ def test_affinities_of_seventy_images_own_are_tried_with_unknowns_of_these() -> 
     assert result.vpv > 2.0 * result.redundancy
 
 
-@parametrize_with_studies("seed", [4, 5, 6, 7], quick=(0, 3))
+@parametrize_with_studies("seed", [4, 5, 6, 7])
 def test_an_estimated_noise_does_not_hide_two_cameras_in_one(seed: int) -> None:
     made = faults.scene(seed, flat=True)
     given = faults.misfit_network(made, faults.Effects(crop=0.5, zoom=0.2), SOUND, np.random.default_rng(seed))
@@ -140,7 +136,7 @@ FITTED = replace(SOUND, sigma=0.1)  # standard deviations given ten times too sm
 
 
 @parametrize_with_studies("seed", [4, 5, 6, 7])
-@pytest.mark.parametrize("noise", [1.0, 10.0])
+@parametrize_with_studies("noise", [1.0, 10.0], quick=(1,))
 def test_each_image_with_a_principal_distance_of_its_own_is_no_two_groups(seed: int, noise: float) -> None:
     made, rng = faults.scene(seed, flat=True), np.random.default_rng(seed)
     zooms = rng.normal(size=len(made.groups))
@@ -325,7 +321,7 @@ def test_points_that_are_given_as_exact_and_are_not_are_not_named_one_by_one() -
 
 def test_a_boards_corner_that_is_bent_up_is_named_by_its_points() -> None:
     """It was taken for a bend and a twist of the whole board."""
-    made = faults.scene(8, flat=True)
+    made = faults.scene(1, flat=True)
     given = faults.misfit_network(made, faults.Effects(), SOUND, np.random.default_rng(2))
     along = (made.points[:, :2] / np.ptp(made.points[:, :2], axis=0)).sum(axis=1)
     corner = {f"PT.p{k}.Z" for k in np.argsort(-along, kind="stable")[:6]}
@@ -360,7 +356,7 @@ def test_a_picture_of_another_size_is_left_out(times: float) -> None:
     assert abs(result.value("IO.cam.c") - faults.C_MM) < 4.0 * result.sigma("IO.cam.c")
 
 
-@parametrize_with_studies("seed", [0, 1, 2, 3], quick=(2,))
+@parametrize_with_studies("seed", [0, 1, 2, 3], quick=(3,))
 def test_two_pictures_of_another_print_are_left_out(seed: int) -> None:
     """Each has less than half of the errors: all images had been called distorted, with marks suspect in some."""
     given_scene = faults.scene(seed, flat=True)
@@ -776,7 +772,6 @@ FAST = (
     "stations in feet, observed orientations",
     "nothing, approximate orientations",
     "sheared films held rigid",
-    "standard deviations of the points ten times too small",
 )
 
 
@@ -799,7 +794,7 @@ def test_what_is_wrong_with_all_is_named(name: str) -> None:
     ],
     quick=(0, 3),
 )
-@pytest.mark.parametrize("apart_mm", [0.02, 0.3])
+@parametrize_with_studies("apart_mm", [0.02, 0.3])
 def test_images_with_another_ones_camera_are_named(moved: str, words: str, apart_mm: float) -> None:
     """Fiducials were called suspect, or an interior orientation of their own was blamed, σ₀ 1.2 to 1.7."""
     network = faults.two_cameras(2, apart_mm, 0.003)
@@ -869,10 +864,11 @@ def test_straight_views_tell_where_the_principal_point_hangs_on_the_decentering(
     assert any("with p1 and p2 free, its standard deviation would be" in note for note in result.notes)
 
 
-def test_no_principal_point_of_straight_views_is_claimed_that_images_do_not_tell() -> None:
+@parametrize_with_studies("seeds", [(2, 3), range(6)])
+def test_no_principal_point_of_straight_views_is_claimed_that_images_do_not_tell(seeds: Iterable[int]) -> None:
     """Linear standard deviations miss a curved valley, and other minima."""
     reported = 0
-    for seed in range(6):
+    for seed in seeds:
         given, y0_mm = _straight_images(seed, ("k1", "k2", "p1", "p2", "k3"))
         result = adjust(given)
         is_reported = any("hardly tell y0 of camera cam from its distortion" in each for each in result.warnings)

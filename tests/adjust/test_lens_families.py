@@ -417,10 +417,10 @@ def draw_calibration(rng: np.random.Generator, change: Array | float = 0.0) -> C
 def test_false_alarms_come_as_often_as_stated() -> None:
     rng = np.random.default_rng(1)
     probabilities = np.array(
-        [compare([draw_calibration(rng), draw_calibration(rng)], CORNERS).same.probability for _ in range(160)]
+        [compare([draw_calibration(rng), draw_calibration(rng)], CORNERS).same.probability for _ in range(80)]
     )
     for level in (0.05, 0.5):
-        expected = 160 * level
+        expected = 80 * level
         assert abs(int((probabilities < level).sum()) - expected) < 3.5 * np.sqrt(expected * (1 - level))
 
 

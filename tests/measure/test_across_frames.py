@@ -202,12 +202,12 @@ def test_what_is_alike_in_scan_axes_is_the_scanners() -> None:
 def test_ordinary_frames_have_no_problem() -> None:
     """One camera in a hundred has one, by each of the tests."""
     rng, own_result = np.random.default_rng(10), 0
-    for number in range(60):
+    for number in range(24):
         layout = make_layout(FOUR if number % 2 else EIGHT)
         frames = make_frames(layout, 1 + number % 4, rng, camera_mm=0.005, film_mm=0.005, poses=("0", "90m"))
         result = check_frames(frames, layout, [(20.0, 20.0)] * len(frames))
         own_result += any(frame.problems for frame in result.frames) or bool(weak(result.frames))
-    assert own_result <= 3
+    assert own_result <= 2
 
 
 def add_edges(frame: FrameMeasurement, sigmas: Sequence[float], off_px: float = 0.1) -> FrameMeasurement:

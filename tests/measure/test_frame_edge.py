@@ -385,7 +385,7 @@ def test_errors_are_as_large_as_their_sigmas_say(blur_px: float, alone: bool) ->
 def test_what_jpeg_does_to_edges_is_in_the_standard_deviations(quality: int, alone: bool) -> None:
     """Residuals alone make them 2.5 and 2.3 times too small."""
     rng, errors = np.random.default_rng(5), []
-    for _ in range(50):
+    for _ in range(32):
         center, steps = CORNER_SIZE // 2 + rng.uniform(-4, 4, 2), board_steps(rng)
         clean = square_picture(center, steps, 0.8, alone)
         noisy = np.rint(clean + rng.normal(0, 1.0, clean.shape)).astype(np.uint8)
@@ -394,8 +394,8 @@ def test_what_jpeg_does_to_edges_is_in_the_standard_deviations(quality: int, alo
         corner = fit_mark(grey, center, steps, alone, quantisation_step_dn(stored.tobytes()))
         if not corner.reason:
             errors.append(whitened(corner.center_px - center, corner.covariance.px2))
-    assert len(errors) >= 45
-    assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.25  # 90 numbers: 7.5 % standard deviation
+    assert len(errors) >= 29
+    assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.25  # 60 numbers: 9 % standard deviation
 
 
 def test_a_corner_of_a_part_is_known_as_well_as_in_the_whole_picture() -> None:

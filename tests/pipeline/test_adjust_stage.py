@@ -678,7 +678,7 @@ def test_points_that_no_image_shows_are_a_note_and_an_unknown_one_in_one_image_i
     assert not any("single" in note for note in result["notes"])
 
 
-@pytest.mark.parametrize("other", ["F1.TIF", "f1.dng"])
+@parametrize_with_studies("other", ["F1.TIF", "f1.dng"])
 def test_names_of_one_image_that_differ_by_case_and_ending_are_named(
     other: str, tmp_path: Path, printed_line: projects.Printed
 ) -> None:
