@@ -82,7 +82,9 @@ def correction_sentence(form: Figure, fiducials: Mapping[str, FiducialRecord], g
         f"{size[worst]:.1f} µm (mark {form.ids[worst]})."
     )
     if not moved:
-        return f"{found} None exceeds {SIGNIFICANT:g} standard deviations."
+        return (
+            f"{found} None exceeds {SIGNIFICANT:g} times its standard deviation, or the given one where that is larger."
+        )
     names = f"mark {moved[0]} exceeds" if len(moved) == 1 else f"marks {listed(moved)} exceed"
     return (
         f"{found} Those of {names} {SIGNIFICANT:g} standard deviations: compare the camera file with {given_by}, and "
