@@ -13,10 +13,10 @@ from pipeline.archive.results_database import ResultsDatabase
 from pipeline.archive.work import Work
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
-from pipeline.measuring.camera_identification import add_plates, fitting_cameras
+from pipeline.measuring.camera_identification import add_plates, fitting_cameras, tried_cameras
 from pipeline.measuring.repeated_views import check_repeated_views
 from pipeline.measuring.roll import check_scans, name_roll, note_same_frames
-from pipeline.measuring.scan_task import ScanTask
+from pipeline.measuring.scan_task import ScanTask, image_options
 from pipeline.provenance import alike_groups, content_hash, fingerprint, shard_number
 from pipeline.results.measured_record import MeasuredScan
 
@@ -143,12 +143,26 @@ def _check_camera(
     """Second step of the measurement. Scans whose marks get other names by it are measured again."""
     scans = name_roll(tasks, [work.read(task.name) for task in tasks], camera.writing, work.measure)
     others = fitting_cameras(camera, scans, project.cameras, project.film.sigma_mm)
+    if len(project.cameras) > 1 and any(Code.NO_FRAME in each.codes for scan in scans for each in scan.frame.problems):
+        others |= tried_cameras(scans, tasks, _other_cameras(project, camera), work.trial)
     checked = [
         scan.changed(problems=[others[scan.frame.image]]) if scan.frame.image in others else scan
         for scan in check_scans(camera, scans, project.film)
     ]
     is_board = project.targets is not None and project.targets.board is not None
     return tuple(check_repeated_views(checked, is_board, work.picture))
+
+
+def _other_cameras(project: Project, camera: CameraFile) -> dict[str, CameraFile]:
+    """The other cameras of a project by name, with the templates of their learned marks."""
+    options, images = image_options(project, {}), list(project.scans)
+    shown = {
+        name: [image for image in images if project.image_camera(image) is each]
+        for name, each in project.cameras.items()
+    }
+    return {
+        name: options(some[0]).camera for name, some in shown.items() if some and project.cameras[name] is not camera
+    }
 
 
 def _writing_remarks(project: Project, tasks: Sequence[ScanTask], work: Work) -> Remarks:

@@ -64,6 +64,13 @@ class Work:
         for task, _ in self._measure(missing):
             yield self.read(task.name)
 
+    def trial(self, tasks: Sequence[ScanTask]) -> Iterator[MeasuredScan]:
+        """Yield the scans of tasks that are none of the project: measured, and not stored. None while only stored
+        results are read."""
+        for _, result in () if self._only_kept else iterate_results(measure_file, tasks, self._executor, TASKS_A_CORE):
+            if isinstance(result, MeasuredFile):
+                yield result.scan
+
     def complete(self, tasks: Sequence[ScanTask], reporter: Reporter) -> None:
         """Measure the missing scans of the project and report how many there are. The scans are not held in memory."""
         known, missing = self._stored_rows(tasks)

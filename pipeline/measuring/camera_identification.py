@@ -2,8 +2,8 @@
 JSON."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -13,11 +13,12 @@ from rich.padding import Padding
 from scipy.special import chdtrc
 
 from measure.annotations.lines import CAMERA, Line, find_fields
-from measure.flags import Code, Reason
+from measure.flags import Code, Reason, Status
 from measure.marks.rendering import known_picture
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polygon
 from measure.results import MarkMeasurement
 from pipeline.files.camera_file import CameraFile
+from pipeline.measuring.scan_task import ScanTask
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import counted
 
@@ -31,6 +32,7 @@ _ALIKE = (
     0.75  # correlation: above it, drawings must be compared by eye; the variants of the K-17's wings have 0.8 to 0.93
 )
 
+_MOST_TRIED = 8  # scans without a frame that are measured as those of another camera
 _FEWEST_FIDUCIALS = 4  # with residuals under an affine transformation
 _FITS, _FITS_NOT = 0.05, 1e-4  # p-values of the camera that fits and, of all scans together, of one that does not
 _USUAL = 2.5  # variance over the median of the smaller of two chi-squares with a few degrees of freedom
@@ -134,6 +136,35 @@ def fitting_cameras(
                 "what sorts the scans by camera."
             )
             found[image] = Reason(sentence, Code.OTHER_CAMERA)
+    return found
+
+
+def tried_cameras(
+    scans: Sequence[MeasuredScan],
+    tasks: Sequence[ScanTask],
+    cameras: Mapping[str, CameraFile],
+    measure: Callable[[Sequence[ScanTask]], Iterable[MeasuredScan]],
+) -> dict[str, Reason]:
+    """Measure scans of one camera without a frame as those of others; the camera with all fiducials, by image.
+
+    cameras: the others, with templates of learned marks; measure: measures tasks without storing the results.
+    """
+    lost = {scan.frame.image for scan in scans if any(Code.NO_FRAME in each.codes for each in scan.frame.problems)}
+    found = dict[str, Reason]()
+    for name, camera in cameras.items():
+        of_other = [
+            replace(task, options=replace(task.options, camera=camera, targets=None, exterior=None))
+            for task in tasks
+            if task.name in lost - found.keys()
+        ]
+        for scan in measure(of_other[:_MOST_TRIED]):
+            marks = [mark for mark in scan.frame.marks if mark.kind == "fiducial"]
+            if len(marks) >= _FEWEST_FIDUCIALS and all(mark.status is Status.MEASURED for mark in marks):
+                sentence = (
+                    f"as a frame of the camera {name} all its {len(marks)} fiducials are measured: it is probably of "
+                    "that one. Correct the column camera of images.csv, or what sorts the scans by camera."
+                )
+                found[scan.frame.image] = Reason(sentence, Code.OTHER_CAMERA)
     return found
 
 

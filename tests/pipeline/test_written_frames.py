@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ from pipeline.measuring.camera_identification import (
     contradictions,
     fitting_cameras,
     parse_plate,
+    tried_cameras,
 )
 from pipeline.measuring.roll import add_known_lines, known_lines, note_same_frames, poses_of_roll
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
@@ -100,6 +102,25 @@ def test_scans_whose_fiducials_fit_another_camera_of_the_project_are_named() -> 
     for seed in range(50):
         assert not fitting_cameras(own, fiducial_scans([own] * 8, 8.0 * film_mm, seed), cameras, film_mm)
         assert not fitting_cameras(own, fiducial_scans([own] * 8, film_mm, seed), cameras, film_mm)
+
+
+def test_a_scan_without_a_frame_is_tried_as_that_of_another_camera() -> None:
+    own, other = (read_camera(library_path(name)) for name in ("wild-rc8-153", "wild-rc8-eight-153"))
+    lost = replace(scan("lost", None), frame=FrameMeasurement("lost", (), problems=(Reason("none", Code.NO_FRAME),)))
+    tasks = [ScanTask(name, f"{name}.tif", ScanOptions(own, None, FiducialOptions())) for name in ("lost", "good")]
+
+    def measured(tried: Sequence[ScanTask], status: Status = Status.MEASURED) -> Iterator[MeasuredScan]:
+        assert [task.name for task in tried] == ["lost"]
+        for task in tried:
+            (result,) = fiducial_scans([task.options.camera], 0.005)
+            marks = [replace(mark, status=status, reason=Reason("faint")) for mark in result.frame.marks]
+            yield replace(result, frame=replace(result.frame, image=task.name, marks=tuple(marks)))
+
+    found = tried_cameras([lost, scan("good", None)], tasks, {"other.toml": other}, measured)
+    assert found.keys() == {"lost"}
+    assert found["lost"].startswith("as a frame of the camera other.toml all its 8 fiducials are measured")
+    weak = partial(measured, status=Status.WEAK)
+    assert not tried_cameras([lost, scan("good", None)], tasks, {"other.toml": other}, weak)
 
 
 def test_frames_csv_has_every_line_with_what_it_says(tmp_path: Path) -> None:
