@@ -256,6 +256,19 @@ def again(scan: measured_record.MeasuredScan, folder: Path = Path("/out")) -> me
     )
 
 
+def test_causes_that_only_earlier_versions_know_count_as_noise() -> None:
+    """They stand in their databases, which are read until the scans are measured again."""
+    mark = RICH.frame.marks[0]
+    assert mark.covariance is not None
+    row = list(measured_record.mark_row(mark))
+    causes = json.loads(str(row[7]))
+    causes["of"] |= {"rounding": [[1.0, 0.0], [0.0, 2.0]], "second order": [[0.5, 0.0], [0.0, 0.5]]}
+    row[7] = json.dumps(causes)
+    covariance = present(measured_record._read_mark(row).covariance)
+    np.testing.assert_allclose(covariance.px2, mark.covariance.px2 + np.diag([1.5, 2.5]))
+    assert {str(cause) for cause in covariance.parts} <= {"noise", *map(str, mark.covariance.parts)}
+
+
 def leaves(value: Any, where: str = "scan") -> Iterator[tuple[str, object]]:
     """Every value in it, with its place and type; numbers to the last bit."""
     if isinstance(value, np.ndarray):
