@@ -131,7 +131,7 @@ def main(folder: Path) -> None:
     with ExitStack() as stack:
         for module in POOLS:
             stack.enter_context(patch(f"pipeline.{module}.worker_pool", lambda *_: ThreadPoolExecutor(1)))
-        stack.enter_context(patch("pipeline.demo.SCENE", (str(first_frame),)))
+        stack.enter_context(patch("pipeline.commands.measuring.SCENE", (str(first_frame),)))
         for module in ("files.library", "archive.new_project"):
             stack.enter_context(patch(f"pipeline.{module}.read_library", lambda: cameras))
         called = [{"extra": extra, **call(arguments)} for extra, arguments in calls(folder)]

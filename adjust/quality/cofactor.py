@@ -17,7 +17,7 @@ from adjust.least_squares.iteration import Linearised
 from adjust.linear_algebra.factor import Factor
 from adjust.problem.estimates import Cofactor
 from adjust.problem.problem import Problem, State
-from adjust.quality.run import Run, derivatives_of
+from adjust.quality.run import Run, linear_derivatives
 from adjust.rank_defect.datum import free_motion
 
 FEWEST_IMAGES = 5  # needed to estimate standard deviations, then to about a third
@@ -233,7 +233,7 @@ def image_equations(at: Linearised, positions: Indices) -> Iterator[tuple[int, A
     for rows in np.split(order, np.flatnonzero(np.diff(frames[order])) + 1):
         columns, matrix, right = problem.columns[rows], at.rows.matrix[rows], at.rows.right[rows].ravel()
         groups = positions, np.unique(columns[own[columns]])
-        by, by_own = (derivatives_of(problem, matrix, each, rows).toarray() for each in groups)
+        by, by_own = (linear_derivatives(problem, matrix, each, rows).toarray() for each in groups)
         left, sizes, _ = np.linalg.svd(by_own / np.maximum(np.linalg.norm(by_own, axis=0), 1e-300), full_matrices=False)
         basis = left[:, sizes > UNDETERMINED * sizes[:1]]
         yield int(frames[rows[0]]), by - basis @ (basis.T @ by), right - basis @ (basis.T @ right)

@@ -198,7 +198,7 @@ class Run:
         given = np.flatnonzero(pairs != ABSENT)
         entries = -self._prior_weights.ravel()[given], (given, numbering.numbers[pairs[given]])
         priors = csr_array(entries, shape=(len(pairs), len(numbering.free)))
-        return csr_array(vstack([derivatives_of(numbering.problem, self.end.rows.matrix, numbering.free), priors]))
+        return csr_array(vstack([linear_derivatives(numbering.problem, self.end.rows.matrix, numbering.free), priors]))
 
     @property
     def _prior_weights(self) -> Array:
@@ -219,7 +219,7 @@ def free_quantities(problem: Problem, positions: Indices) -> Problem:
     return replace(problem, unknowns=replace(problem.unknowns, sigma=sigma))
 
 
-def derivatives_of(problem: Problem, matrix: Array, positions: Indices, rows: Indices | None = None) -> csr_array:
+def linear_derivatives(problem: Problem, matrix: Array, positions: Indices, rows: Indices | None = None) -> csr_array:
     """(2 n, k) derivatives of all observations, or of some rows, by some quantities.
 
     matrix (n, 2, j): derivatives by the quantities at `Problem.columns`.

@@ -249,15 +249,15 @@ class _Solver:
         def agrees(result: Adjustment) -> bool:
             return result.converged and (not first.converged or self.trials.explains(result))
 
-        def adjusted(rest: Network) -> Adjustment:
+        def readjust(rest: Network) -> Adjustment:
             return self.adjust_without_blind(rest, self.initial_values(rest))
 
         if first.termination != "singular":
-            found = _leave_out_contradicting(part, first, adjusted, agrees, several=False)
+            found = _leave_out_contradicting(part, first, readjust, agrees, several=False)
         # A few images that show something of another shape look like images distorted each in its own way.
         is_gross = found is first and first.converged and first.sigma0 > WHOLE
         if is_gross and any(each.kind == "affinities" for each in first.explanations):
-            found = _leave_out_contradicting(part, first, adjusted, agrees, several=True)
+            found = _leave_out_contradicting(part, first, readjust, agrees, several=True)
         return replace(found, left_out={**left_out, **found.left_out})
 
     def adjust_without_blind(self, part: Network, start: Approximations | None) -> Adjustment:

@@ -120,7 +120,7 @@ def explain(
             break
         last = alike[0]
         if len(alike) == 1 and last.kind == "groups":
-            last = _with_separate_lenses(last) or last
+            last = _separate_lenses(last) or last
         if len(alike) > 1 or last.kind in ENDING:
             break
     noises = (_added_noise(last.run, last.redundancy), _wide_control(last.run)) if last.exceeds(LEVEL) else ()
@@ -264,7 +264,7 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
         return [], False
     variance = max(1.0, min(each.rest[0] / each.rest[1] for each in (model, *found)))
     for general, special in GENERAL.items():
-        found = _without_nested(found, variance, general, special)
+        found = _drop_nested(found, variance, general, special)
     criteria = [each.criterion(variance) + each.costs for each in found]
     without = model.criterion(variance) - min(criteria) if model.gross_errors else np.inf
     if without < -DECISIVE:
@@ -273,7 +273,7 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
     return alike, bool(without < DECISIVE)
 
 
-def _without_nested(found: list[_Model], variance: float, general: str, special: tuple[str, ...]) -> list[_Model]:
+def _drop_nested(found: list[_Model], variance: float, general: str, special: tuple[str, ...]) -> list[_Model]:
     """Keep the special hypotheses, or one with unknowns for every image if it explains significantly more."""
     pairs = [(one, other) for one, other in product(found, found) if one.kind == general and other.kind in special]
     further = [(s.redundancy - g.redundancy, max(0.0, s.vpv - g.vpv) / variance) for g, s in pairs]
@@ -282,7 +282,7 @@ def _without_nested(found: list[_Model], variance: float, general: str, special:
     return [each for each in found if each.kind not in dropped]
 
 
-def _with_separate_lenses(model: _Model) -> _Model | None:
+def _separate_lenses(model: _Model) -> _Model | None:
     """Give two groups of images entirely separate lenses; None without a solution, or with fiducial marks."""
     network = model.run.problem.network
     if any(camera.fiducials for camera in network.cameras):

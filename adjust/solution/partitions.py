@@ -20,7 +20,7 @@ from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.lens import INTERIOR_NAMES
 from adjust.problem.problem import Problem
 from adjust.quality.cofactor import image_equations
-from adjust.quality.run import Run, derivatives_of
+from adjust.quality.run import Run, linear_derivatives
 
 FLAT = 1e-9  # fraction of the largest eigenvalue below which a direction is undetermined
 MOST_TURNS = 20  # iterations of two-means
@@ -215,7 +215,7 @@ def displaced_points(
     # N (p, 3, p, 3) and g (p, 3), the unknowns of the run eliminated; 0 for coordinates that are not fixed.
     positions = np.concatenate([problem.unknowns.point[name] for name in names])
     is_fixed = diags_array(np.concatenate([*fixed.values()]) * 1.0)
-    by_points = derivatives_of(problem, at.rows.matrix, positions) @ is_fixed
+    by_points = linear_derivatives(problem, at.rows.matrix, positions) @ is_fixed
     across = (run.unit_functions[: by_points.shape[0]].T @ by_points).toarray()
     normal = (by_points.T @ by_points).toarray() - across.T @ run.factor.cofactor_times(across)
     normal, right = normal.reshape(count, 3, count, 3), (by_points.T @ at.rows.right.ravel()).reshape(count, 3)

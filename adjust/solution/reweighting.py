@@ -181,10 +181,10 @@ def _iterate(problem: Problem, weighting: Weighting, state: State, limit: int) -
     weighted, covariance = weighting.apply(problem)
     numbering = Numbering(weighted)
 
-    def singular_at(at: Linearised) -> tuple[NullDirection, ...]:
+    def null_directions(at: Linearised) -> tuple[NullDirection, ...]:
         return singular_directions(numbering, at.state, at.factor)
 
-    solution = iterate(numbering, covariance, state, limit, lambda start: bool(singular_at(start)))
+    solution = iterate(numbering, covariance, state, limit, lambda start: bool(null_directions(start)))
     if solution is None:
         reasons = {name: f"{reason}. {check}" for name, (reason, check) in blind_marks(problem, state).items()}
         of_name = problem.network.image_by_name
@@ -192,7 +192,7 @@ def _iterate(problem: Problem, weighting: Weighting, state: State, limit: int) -
             f"The adjustment cannot start: with the approximations, {next(iter(reasons.values()), '')}",
             {of_name[name].frame: reason for name, reason in reasons.items() if name},
         )
-    singular = singular_at(solution.end)
+    singular = null_directions(solution.end)
     if singular:
         ended: Termination = "singular" if solution.termination in ("converged", "singular") else "diverged"
         solution = replace(solution, factor=None, termination=ended)

@@ -276,7 +276,7 @@ def _named_by_codes(searches: Sequence["_Search"], codes: Mapping[int, int]) -> 
         grown = grow(view, points[agree], coded[agree], search.xyz, search.normals, marks)
         probability = min(np.pi * (2.0 * grown.gate) ** 2 / float(np.prod(marks.greatest - marks.least)), 1.0)
         right = sum(grown.mark.get(point) == mark for mark, point in codes.items())
-        grown = replace(grown, log10_false_alarms=log10_false_alarms_of(right, len(codes), probability, tests))
+        grown = replace(grown, log10_false_alarms=log10_expected_alarms(right, len(codes), probability, tests))
         candidates.append((search, grown, right))
     if not candidates:
         return f"the {len(codes)} coded targets recognised lie on one line and do not orient the image"
@@ -504,7 +504,7 @@ def grow(view: View, points: Indices, named: Indices, xyz: Array, normals: Array
         return Grown(view)
     # A pose fitted to all points may differ by the gate from that of three points: twice the gate.
     probability = float(marks.probability(view.images(xyz[shown]), np.full(len(shown), 2.0 * gate)).mean())
-    log10_false_alarms = log10_false_alarms_of(
+    log10_false_alarms = log10_expected_alarms(
         agreeing, len(shown), probability, (float(len(xyz)) * len(marks.places)) ** OF_POSE
     )
     mark = dict(zip(points.tolist(), named.tolist(), strict=True))
@@ -569,7 +569,7 @@ def _fit_view(view: View, xyz: Array, places: Array, marks: Marks) -> tuple[View
     return view, sigma, covariance
 
 
-def log10_false_alarms_of(agreeing: int, expected: int, probability: float, tests: float) -> float:
+def log10_expected_alarms(agreeing: int, expected: int, probability: float, tests: float) -> float:
     """log10 of the expected number of poses with so many agreeing points under the null hypothesis (binomial).
 
     Three of the points always agree, with up to four poses for each of the possible tests.

@@ -125,12 +125,12 @@ def _apply_to_task(task: ScanTask, decisions: Iterable[Decision]) -> ScanTask:
     clicks = list[Click]()
     for one in sorted(decisions, key=lambda one: one.subject):
         if one.decision is DecisionKind.POSE:
-            task = task.with_options(pose=one.pose)
+            task = task.change_options(pose=one.pose)
         elif one.decision is DecisionKind.PLACE and one.subject[2] == "fiducial":
             assert one.col_px is not None
             assert one.row_px is not None
             clicks.append(Click(one.point, one.col_px, one.row_px))
-    return task.with_options(clicks=tuple(clicks))
+    return task.change_options(clicks=tuple(clicks))
 
 
 def _apply_decisions(scan: MeasuredScan, counting: Mapping[About, Decision]) -> MeasuredScan:

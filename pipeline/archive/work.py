@@ -173,7 +173,7 @@ class Work:
         """Rows of the stored results for the tasks' present files and options, by image, and tasks that have none, with
         the decisions about their scans applied."""
 
-        def pose_of(key: str) -> str | None:
+        def result_pose(key: str) -> str | None:
             row = self._rows.get(key)
             return None if row is None else self._database.pose_name(row)
 
@@ -183,7 +183,7 @@ class Work:
             if decisions := self.decisions.get(task.name):
                 reviewed_file = identity or FileIdentity(self.state(task), parts_hash(scan_path(task.scan)))
                 reviewed, self.counting[task.name] = review_decisions.apply_decisions(
-                    task, decisions, partial(_key, reviewed_file), pose_of, self._database.later_keys
+                    task, decisions, partial(_key, reviewed_file), result_pose, self._database.later_keys
                 )
             row = None if identity is None else self._rows.get(_key(identity, reviewed))
             if row is None:

@@ -5,6 +5,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,13 +15,14 @@ from pipeline.archive.verdicts import Verdict
 from pipeline.commands import shared
 from pipeline.errors import InputError, missing_extra
 from pipeline.terminal import PlainConsole, plain
-from pipeline.text.files import no_such_file
+from pipeline.text.files import make_folder, no_such_file
 from pipeline.text.wording import counted
 
 if TYPE_CHECKING:
     from pipeline.files.project_file import Project
 
 PROJECT = "project.toml"
+SCENE = ("scenes", "demo.toml")  # of the demonstration, in synthetic_images
 LIBRARY_STEP = shared.command_step(
     "cameras NAME > camera.toml", why="a camera file to start from; or: reseau template camera"
 )
@@ -33,10 +35,19 @@ def demo(
     as_json: shared.AsJson = False,
 ) -> int:
     """Render five film frames and run everything on them."""
-    from pipeline.demo import run_demo
+    from pipeline.files.project_file import read_project
     from pipeline.progress import Reporter
+    from pipeline.rendered.scene_file import TRUTH, render_project
+    from pipeline.stages import run_all
 
-    return shared.finish(run_demo(folder, Reporter()), as_json, folder / "project.toml")
+    make_folder(folder)
+    if any(folder.iterdir()) and not (folder / TRUTH).exists():
+        raise InputError(f"{folder}: holds something that is no demonstration. Name another folder: reseau demo DIR")
+    scene = resources.as_file(resources.files("synthetic_images").joinpath(*SCENE))
+    reporter, project = Reporter(), folder / PROJECT
+    with scene as path, reporter.stage("rendering strip") as count:
+        render_project(path, folder, count)
+    return shared.finish(run_all(read_project(project), reporter), as_json, project)
 
 
 def init(

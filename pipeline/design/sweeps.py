@@ -53,7 +53,7 @@ class Variations:
         values = self.values | {"seed": self.values.get("seed", 1) + layout} if layout else self.values
         return scene_setup(parse_scene(Table(values, self.path, "")))
 
-    def with_value(self, number: int, sweep: Sweep, value: float | str) -> "Variations":
+    def set_value(self, number: int, sweep: Sweep, value: float | str) -> "Variations":
         """The scene with the quantity of a sweep set to a value. Raises InputError for an unknown quantity."""
         try:
             values = self._changed_values(sweep.quantity, value)
@@ -201,7 +201,7 @@ class Swept:
 
 def sweep(scene: Variations, number: int, planned: Sweep, progress: Count = lambda *_: None) -> Swept:
     """Carry out a sweep. number: of the sweep in the scene, for messages. Raises InputError for an unknown quantity."""
-    varied = [scene.with_value(number, planned, value) for value in planned.values]
+    varied = [scene.set_value(number, planned, value) for value in planned.values]
     steps = []
     for done, variation in enumerate(varied, 1):
         value: float | str = planned.values[done - 1]

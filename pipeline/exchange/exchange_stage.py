@@ -23,13 +23,7 @@ from pipeline.files.camera_file import CameraFile, camera_text
 from pipeline.files.camera_tables import DEFAULT_SIGMA_MM
 from pipeline.files.object_files import ELEMENTS
 from pipeline.files.project_file import Project
-from pipeline.results.comparator_file import (
-    ComparatorPoint,
-    comparator_from_pixel,
-    comparator_lines,
-    describe_decisions,
-    read_decision_counts,
-)
+from pipeline.results import comparator_file
 from pipeline.text.csv_table import csv_line
 from pipeline.text.files import file_word, make_folder, path_below, write_atomically, writing
 from pipeline.text.wording import listed
@@ -71,7 +65,7 @@ def run_export(project: Project, format: str, folder: Path, options: ExportOptio
                 f"cameras {camera!r} and {frame.camera!r} would have the same files {file_word(camera)!r}. Rename one."
             )
     written: Written = write(block, options)
-    decisions = describe_decisions(read_decision_counts(project.comparator))
+    decisions = comparator_file.describe_decisions(comparator_file.read_decision_counts(project.comparator))
     written = replace(written, notes=tuple(filter(None, [*written.notes, *block.lens_reach.values(), decisions])))
     parts = {"Lost": written.lost, "Notes": written.notes, "Left out": written.left_out}
     col, row = convention.first_pixel_px
@@ -206,12 +200,14 @@ def _comparator(marks: Sequence[ForeignMark], options: ImportOptions) -> str:
                     "marks have that bring none."
                 )
             covariance = options.sigma_px**2 * np.eye(2)
-        place = comparator_from_pixel(mark.place, pitch)
-        mm2 = comparator_from_pixel(comparator_from_pixel(covariance, pitch).T, pitch)
+        place = comparator_file.comparator_from_pixel(mark.place, pitch)
+        mm2 = comparator_file.comparator_from_pixel(comparator_file.comparator_from_pixel(covariance, pitch).T, pitch)
         sigma = np.sqrt(np.diag(mm2))
         rho = float(mm2[0, 1] / sigma.prod())
-        rows.append(ComparatorPoint(mark.image, mark.point, mark.kind, place, sigma, rho, Status.MEASURED, ""))
-    return "".join(comparator_lines(rows, dict.fromkeys(sorted({mark.image for mark in marks}), pitch)))
+        rows.append(
+            comparator_file.ComparatorPoint(mark.image, mark.point, mark.kind, place, sigma, rho, Status.MEASURED, "")
+        )
+    return "".join(comparator_file.comparator_lines(rows, dict.fromkeys(sorted({mark.image for mark in marks}), pitch)))
 
 
 def _images(poses: Sequence[ForeignPose], cameras: Sequence[Path]) -> str:

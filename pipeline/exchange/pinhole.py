@@ -111,7 +111,7 @@ def nearest_lens(
     """
     lens = frame.lens
     if options.with_lens or lens.distortion.family == "none":
-        return FittedLens(_without_distortion(lens), 0.0)
+        return FittedLens(_remove_distortion(lens), 0.0)
     if lens.distortion.family == FISHEYE:
         farthest_mm = float(np.abs(frame_corners_mm(block, frame)[:, 1] - lens.interior[2]).max())
         return FittedLens(lens, abs(float(lens.parameters[-1])) * farthest_mm)
@@ -138,7 +138,7 @@ def sheared_lens(block: ImageBlock, frame: OutFrame, at_ideal: bool) -> FittedLe
     lens = frame.lens
     family = lens.distortion.family
     if family == "none":
-        return FittedLens(_without_distortion(lens), 0.0)
+        return FittedLens(_remove_distortion(lens), 0.0)
     if _has_only(lens, BROWN if at_ideal else (*BROWN, *_AFFINE)):
         return FittedLens(lens, 0.0)
     if family in _ONE_SCALE or not at_ideal:
@@ -175,7 +175,7 @@ def frame_corners_mm(block: ImageBlock, frame: OutFrame) -> Array:
     return np.array([observed.min(axis=0), observed.max(axis=0)])
 
 
-def _without_distortion(lens: Lens) -> Lens:
+def _remove_distortion(lens: Lens) -> Lens:
     return Lens(Distortion("opencv"), lens.interior, np.zeros(len(parameter_names("opencv"))))
 
 
@@ -197,7 +197,7 @@ def _fit_opencv(block: ImageBlock, frame: OutFrame, names: Sequence[str]) -> Fit
     try:
         found = convert_lens(lens, into, corners_mm, estimated)
     except AdjustmentError:  # treat it as a model that does not fit
-        return FittedLens(_without_distortion(lens), np.inf)
+        return FittedLens(_remove_distortion(lens), np.inf)
     return FittedLens(found.lens, found.largest_mm)
 
 

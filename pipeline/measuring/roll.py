@@ -42,7 +42,7 @@ def name_roll(
     free = [scan for task, scan in both if task.options.fiducials.pose == "auto" and not scan.failure]
     poses = poses_of_roll(free, places)
     names = {scan.frame.image: scan.frame.pose.name for scan in free if scan.frame.pose}
-    again = [task.with_orientation(poses[task.name].name) for task in tasks if task.name in poses]
+    again = [task.fix_orientation(poses[task.name].name) for task in tasks if task.name in poses]
     other = [task for task in again if task.options.fiducials.pose != names.get(task.name)]
     new = {scan.frame.image: scan for scan in (measure(other) if other else ())}
     named = []
@@ -87,7 +87,7 @@ def add_known_lines(
     for task in tasks:
         lines = known.get(id(task.options.camera), ())
         if lines and task.name not in measured and task.options.fiducials.writing == "pose":
-            options.setdefault(id(task.options), task.with_options(known_lines=lines).options)
+            options.setdefault(id(task.options), task.change_options(known_lines=lines).options)
             task = replace(task, options=options[id(task.options)])
         knowing.append(task)
     return tuple(knowing), measured

@@ -94,17 +94,17 @@ class ScanTask:
 
         return open_scan(scan_path(self.scan), self.max_pixels).replace_name(self.name)
 
-    def with_orientation(self, pose: str) -> "ScanTask":
+    def fix_orientation(self, pose: str) -> "ScanTask":
         """Copy with a known scan orientation; no text is read."""
-        return self.with_options(pose=pose, writing="none", known_lines=())
+        return self.change_options(pose=pose, writing="none", known_lines=())
 
-    def with_options(self, **fiducials: Any) -> "ScanTask":
+    def change_options(self, **fiducials: Any) -> "ScanTask":
         """Copy with other options of the fiducials."""
         return replace(self, options=replace(self.options, fiducials=replace(self.options.fiducials, **fiducials)))
 
     def fiducials_alone(self, tone: float | str) -> "ScanTask":
         """Copy that measures only the fiducials, with the given tone curve."""
-        task = self.with_options(writing="none", known_lines=())
+        task = self.change_options(writing="none", known_lines=())
         return replace(task, options=replace(task.options, tone=tone, tone_information=(), targets=None, exterior=None))
 
 

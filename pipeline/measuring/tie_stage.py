@@ -106,7 +106,7 @@ def _check_fiducials_by_joins(scans: Sequence[MeasuredScan]) -> list[MeasuredSca
             result[image] = replace(scan, frame=replace(scan.frame, problems=problems))
         elif 0 < len(_fiducials(scan)) < _CHECKED:
             few = Reason("so few fiducials fit many frames, and no other part of this one checks them", Code.NO_CHECK)
-            result[image] = scan.with_status("fiducial", Status.WEAK, few)
+            result[image] = scan.change_status("fiducial", Status.WEAK, few)
     # Fiducials outside of a scan that another partial scan shows are not missing.
     shown = {point: image for image, scan in reversed(result.items()) for point in _fiducials(scan)}
     agreed = []
@@ -166,7 +166,7 @@ def _add_contradiction(scan: MeasuredScan, other: MeasuredScan, off_mm: float) -
         Code.AMBIGUOUS,
     )
     if len(_fiducials(scan)) <= len(_fiducials(other)):
-        scan = scan.with_status("fiducial", Status.REJECTED, Reason(what, Code.AMBIGUOUS))
+        scan = scan.change_status("fiducial", Status.REJECTED, Reason(what, Code.AMBIGUOUS))
     return scan.changed(problems=[problem])
 
 

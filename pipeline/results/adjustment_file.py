@@ -58,8 +58,8 @@ class ParameterCovariance:
         block: Array = self.matrix[np.ix_(at, at)]
         block[at < 0, :] = 0.0
         block[:, at < 0] = 0.0
-        for image in {self._image_of[key] for key in keys if key in self._image_of}:
-            own = [i for i, key in enumerate(keys) if self._image_of.get(key) == image]
+        for image in {self._image_numbers[key] for key in keys if key in self._image_numbers}:
+            own = [i for i, key in enumerate(keys) if self._image_numbers.get(key) == image]
             block[np.ix_(own, own)] = self.images[image].select(keys[i] for i in own)
         return block
 
@@ -80,7 +80,7 @@ class ParameterCovariance:
         return {each: i for i, each in enumerate(self.parameters)}
 
     @cached_property
-    def _image_of(self) -> dict[Parameter, int]:
+    def _image_numbers(self) -> dict[Parameter, int]:
         return {each: i for i, image in enumerate(self.images) for each in image.parameters}
 
 

@@ -93,7 +93,7 @@ class MeasuredScan:
         frame = replace(frame, marks=marks, problems=(*frame.problems, *problems))
         return replace(self, frame=frame, notes=(*self.notes, *notes))
 
-    def with_status(self, kind: Kind | None, status: Status, reason: Reason) -> "MeasuredScan":
+    def change_status(self, kind: Kind | None, status: Status, reason: Reason) -> "MeasuredScan":
         """Copy in which the observed marks of a kind, or all, have another status."""
         return self.changed(
             [

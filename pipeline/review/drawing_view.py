@@ -350,7 +350,7 @@ def handles(mark: MarkJson, toward: Point = (1.0, 1.0)) -> Iterator[Handle]:
         yield _length(mark, "line_mm", angle + 90.0, 2.0, side=(start + end) / 2)
     if "size_mm" in mark:
         half, key = mark["size_mm"] / 2, "size_mm"
-        yield Handle(key, (half, half), lambda place: _with_value(mark, key, max(2 * np.abs(place).max(), _LEAST_MM)))
+        yield Handle(key, (half, half), lambda place: _set_value(mark, key, max(2 * np.abs(place).max(), _LEAST_MM)))
     for at, vertex in enumerate(mark.get("vertices_mm", ())):
         yield Handle(
             f"vertices_mm.{at}",
@@ -446,22 +446,22 @@ def _length(
 
     def dragged(place: Array) -> MarkJson:
         value = factor * (float(along @ (place - start)) - offset)
-        return _with_value(mark, key, max(value, 0.0 if key in ("gap_mm", "reach_mm") else _LEAST_MM))
+        return _set_value(mark, key, max(value, 0.0 if key in ("gap_mm", "reach_mm") else _LEAST_MM))
 
     return Handle(key, camera_drawing.as_point(start + along * (offset + mark.get(key, 0.0) / factor)), dragged)
 
 
 def _place(mark: MarkJson, key: str) -> Handle:
-    return Handle(key, camera_drawing.as_point(mark[key]), lambda place: _with_value(mark, key, place.tolist()))
+    return Handle(key, camera_drawing.as_point(mark[key]), lambda place: _set_value(mark, key, place.tolist()))
 
 
-def _with_value(mark: MarkJson, key: str, value: Any) -> MarkJson:
+def _set_value(mark: MarkJson, key: str, value: Any) -> MarkJson:
     return scaled_mark({**mark, key: value})
 
 
 def _drag_item(mark: MarkJson, key: str, at: int, dragged: Callable[[Array], Any], place: Array) -> MarkJson:
     """Mark with an item of a list dragged to a place."""
-    return _with_value(mark, key, [*mark[key][:at], dragged(place), *mark[key][at + 1 :]])
+    return _set_value(mark, key, [*mark[key][:at], dragged(place), *mark[key][at + 1 :]])
 
 
 def _cross(mark: MarkJson) -> Iterator[Handle]:

@@ -183,7 +183,7 @@ def measured_from_clicks(project: Project, image: str, clicks: Sequence[Click]) 
     if unknown:
         raise InputError(f"{image}: its camera has no mark {', '.join(unknown)}.")
     (task,) = scan_tasks(project, [image])
-    return _try_measurement(task.with_options(clicks=tuple(clicks)))
+    return _try_measurement(task.change_options(clicks=tuple(clicks)))
 
 
 def measured_as_shown(project: Project, shown: str, px: Mapping[str, tuple[float, float]], image: str) -> MeasuredScan:
@@ -212,5 +212,5 @@ def camera_as_shown(project: Project, camera: CameraFile, clicks: Clicks) -> Cam
 
 
 def _try_measurement(task: ScanTask) -> MeasuredScan:
-    task = task.with_options(writing="none")
+    task = task.change_options(writing="none")
     return measured_scan(replace(task, options=replace(task.options, targets=None, exterior=None)))

@@ -363,7 +363,7 @@ def test_status_tells_what_changed_outside(folder: Path, printed: projects.Print
 def test_status_says_why_a_scan_needs_attention(folder: Path) -> None:
     scan, *_ = read_measurement(folder / "out" / "measurement.db")
     assumed = replace(scan, frame=replace(scan.frame, pose=ScanOrientation("90", decided=False)))
-    doubted = scan.with_status("fiducial", Status.WEAK, Reason("it is dusty", Code.DUST))
+    doubted = scan.change_status("fiducial", Status.WEAK, Reason("it is dusty", Code.DUST))
     assert scan_doubt(scan) == ""
     assert scan_doubt(assumed) == "scan orientation 90 is assumed"
     assert scan_doubt(assumed.changed(problems=[Reason("it is bent", Code.PITCH)])) == "it is bent"

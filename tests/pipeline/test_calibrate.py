@@ -32,13 +32,13 @@ from measure.flags import Status
 from pipeline import InputError
 from pipeline.adjusting.adjust_stage import adjust_marks
 from pipeline.adjusting.picture_turn import turned_back
+from pipeline.archive.cross_scan_checks import check_repeated_views
 from pipeline.calibration import calibrate_stage, intrinsics
 from pipeline.calibration.calibrate_stage import CalibrationResult
 from pipeline.calibration.intrinsics import LensChoice, LensModel, choose_lens
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures
 from pipeline.calibration.project_files import CalibrationOptions, board_options, check_folder, write_project
 from pipeline.files.target_table import read_targets
-from pipeline.measuring.repeated_views import check_repeated_views
 from pipeline.opencv_check.check import BoardPictures, compare_corners, detector_name, find_points
 from pipeline.opencv_check.opencv_calibration import NAMES, Freedom, OpenCvCalibration, OpenCVPoints, calibrate
 from pipeline.results.comparator_file import ComparatorPoint

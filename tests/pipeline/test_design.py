@@ -152,19 +152,19 @@ def test_the_network_is_what_the_frames_show(tmp_path: Path) -> None:
     ],
 )
 def test_quantities_vary(tmp_path: Path, quantity: str, value: float, found: Callable[[object], float]) -> None:
-    varied = Variations.read(small(tmp_path)).with_value(1, Sweep(quantity=quantity, values=(value, 99)), value)
+    varied = Variations.read(small(tmp_path)).set_value(1, Sweep(quantity=quantity, values=(value, 99)), value)
     assert found(varied.setup()) == pytest.approx(value)
 
 
 def test_points_and_cameras_of_other_files_can_be_varied_and_natural_points_not(tmp_path: Path) -> None:
-    setup = Variations.read(small(tmp_path)).with_value(1, Sweep(quantity="field.points", values=(100, 1)), 100).setup()
+    setup = Variations.read(small(tmp_path)).set_value(1, Sweep(quantity="field.points", values=(100, 1)), 100).setup()
     assert np.ptp([point.xyz[:2] for point in setup.points], axis=0) == pytest.approx([4.0 * 9 / 10] * 2)
     sweep = Sweep(quantity="camera.principal_distance_mm", values=(210.0, 300.0))
-    varied = Variations.read(SCENES / "aerial_five.toml").with_value(1, sweep, 210.0).setup()
+    varied = Variations.read(SCENES / "aerial_five.toml").set_value(1, sweep, 210.0).setup()
     assert (varied.lens.principal_distance_mm, len(varied.camera.fiducials)) == (210.0, 8)
     camera = SMALL[SMALL.index("[camera]") : SMALL.index("[field]")]
     scene = small(tmp_path, (camera, 'camera = "library:wild-rc8-153"\n'))
-    assert Variations.read(scene).with_value(1, sweep, 210.0).setup().lens.principal_distance_mm == 210.0
+    assert Variations.read(scene).set_value(1, sweep, 210.0).setup().lens.principal_distance_mm == 210.0
     with pytest.raises(InputError, match="has no targets"):
         scene_setup(read_scene(SCENES / "juhl_natural.toml"))
 

@@ -266,7 +266,7 @@ def test_a_few_frames_of_a_roll_are_read_and_the_others_know_by_what() -> None:
         known = task.options.fiducials.known_lines
         assert [each.text[:11] for each in known] == ([] if task.name in read else ["DEVELOPMENT"])
     assert len({id(task.options) for task in knowing}) == 2
-    assert knowing[0].with_orientation("90").options.fiducials.known_lines == ()
+    assert knowing[0].fix_orientation("90").options.fiducials.known_lines == ()
     nine = [f"{n}" for n in range(9)]
     for none in (roll_tasks(["a", "b", "c", "d"]), roll_tasks(nine, "all"), roll_tasks(nine, has_marks=False)):
         assert add_known_lines(none, measure, Reporter(Console(quiet=True))) == (tuple(none), {})
