@@ -131,7 +131,7 @@ class Cause(MeaningfulWord):
         "Model misfit: at the edges the image differs from the drawing by more than noise.",
     )
     DAMAGE = "damage", "Faint damage may remain around the damaged pixels that were left out."
-    TEXTURE = "texture", "Background texture on one side of its edges."
+    TEXTURE = "texture", "Background texture on one side of its edges, or a pattern over the whole scan."
     TONE = "tone", "Uncertainty of the tone curve between light and grey values."
     SHARPENING = "sharpening", "Uncertainty of the scan's sharpening."
     CHANGED_TONES = "changed tones", "A learned mark may have other half tones than in the scans it was learned from."
@@ -146,7 +146,10 @@ class Cause(MeaningfulWord):
     SECOND_METHOD = "second method", "Disagreement with the position from its edges."
     GIVEN_PLACES = "given places", "Disagreement with the given coordinates."
     OTHER_FRAMES = "other frames", "Disagreement with the camera's other frames."
-    INTERPOLATION = "interpolation", "Interpolation between two scans, or none: nearest neighbours."
+    INTERPOLATION = (
+        "interpolation",
+        "Interpolation between two scans, of a scan enlarged or reduced, or none: nearest neighbours.",
+    )
     MOTION = "motion", "Motion blur of the whole scan: the place lies anywhere in it."
     SMEAR = (
         "smear",

@@ -318,16 +318,19 @@ def present_frame(
 
     Notes
     -----
-    Measured marks become weak if the frame may be a false alarm or is faint. If its names are ambiguous, or it is more
-    likely a false alarm than not, no mark is an observation.
+    Measured marks become weak if the frame may be a false alarm or is faint, or its scan allows no more. If its names
+    are ambiguous, or it is more likely a false alarm than not, no mark is an observation.
     """
     if Code.NO_FRAME in doubt.codes:
         places = zip(frame.layout.marks, frame.detections, frame.predicted_px, strict=True)
         marks = tuple(_unmeasured(mark.id, each, place, doubt) for mark, each, place in places)
         return FrameMeasurement(frame.scan.name, marks, pose, problems=tuple(problems), weights=frame.weights)
     for altered in find_alterations(frame.scan):
-        detections = (each.amend(parts={altered.cause: altered.px2}) for each in frame.detections)
+        own_px2 = (np.zeros((2, 2)) if each.fit is None else each.fit.covariance_px2 for each in frame.detections)
+        parts = ({altered.cause: altered.covariance(px2)} for px2 in own_px2)
+        detections = (each.amend(parts=part) for each, part in zip(frame.detections, parts, strict=True))
         frame, problems = replace(frame, detections=tuple(detections)), (*problems, altered.reason)
+        doubt = doubt or altered.doubt
     unnamed = next((problem for problem in problems if Code.AMBIGUOUS in problem.codes), NO_REASON)
     marks = tuple(_row(mark, index, frame, pose, doubt, unnamed) for index, mark in enumerate(frame.layout.marks))
     problems = (*problems, *_orientation_problems(frame, pitch_um))

@@ -1,9 +1,15 @@
-"""Scans altered as a whole before they came, told by what this leaves everywhere: nearest neighbours, and motion.
+"""Scans altered as a whole before they came, told by what this leaves everywhere: nearest neighbours, interpolation,
+screens of prints, and motion.
 
 Turned or scaled with nearest neighbours, every pixel was copied from the nearest one of the source. Under a small turn
 rows jump sideways by one pixel at regular distances, and columns in the other direction at the same distances. Under a
 small enlargement rows or columns stand twice at regular distances. A mark between two steps was moved as a whole, by up
 to half a pixel along each axis, and shows nothing of it.
+
+Interpolation at a regular spacing smooths most where it falls between two pixels: rows and columns are rough at a
+period that the scale gives (Gallagher, 2005, Detection of linear and cubic interpolation in JPEG compressed images).
+
+The screen of a printed picture is a lattice of dots, which stands out in the power spectrum as single lines.
 
 Motion along a line multiplies the power spectrum of the scan by a squared sinc across that line. Its zeros tell it from
 texture and lens, whose spectra are smooth. Where a line of a mark became a bar of even grey, its fit lies anywhere in
@@ -14,10 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import fft
-from scipy.ndimage import median_filter
+from scipy.ndimage import maximum_filter1d, median_filter
 
 from measure.array_types import Array, Single
-from measure.flags import Cause, Code, Reason
+from measure.flags import NO_REASON, Cause, Code, Reason
 from measure.scans.scan import Scan
 
 _WIDE_PX, _LONG_PX = 256, 4096  # largest strips of rows and columns through the centre that are looked at
@@ -25,12 +31,20 @@ _LEAST_DISTANCE_PX = 16  # between steps: several in a mark average out
 _FEWEST_STEPS = 4
 _MOSTLY = 0.75  # fraction of the distances between rows that are alike
 _AROUND = 25  # rows whose median is what the picture's own slanted lines make
+_CLOSELY_AROUND = 15  # the same for roughness, whose periods are shorter
+_MOST_ROUGH = 5.0  # times the usual difference of rows: marks of alike sizes on plain film have more
 _MOST_SIGMAS = 6.0  # jumps are limited to as many: single ones may be anything
 _OUTLYING, _MOST_OUTLYING = 3.0, 100  # standard deviations of rows whose distances are tried, and their largest number
 _DISTANCES = 8  # that are tried, those between most of these rows
 _SIGNIFICANT = 5.0  # standard deviations of a regular jump: film, compressed, sharpened or clipped, reaches 4.5
 _BLOCK_PX = 8  # of JPEG, whose grid rows and columns show as well
 _FEW_BLOCKS = 5  # at fewer, thirds of blocks show, too
+_PERIODS, _ALL_NEAR = 16384, 7  # frequencies of the roughness that are sampled, and how many of them a line is wide
+_LOWEST, _OFF_GRID = 0.05, 0.0022  # per pixel: least frequency of a line, and least distance from those of the grid
+_STANDS_OUT = 120.0  # times the median power; film that is not interpolated reaches 80
+_BEYOND_GRID = 10.0  # times the line of blocks that one of half their size has at least; of blocks: 2.6
+_LINE, _LINE_AROUND = 4.0, 11  # logarithm of a line of a screen over the median around; other scans: 2.0
+_COARSEST_SCREEN = 0.08  # per pixel: coarser ones are single dots to a mark
 _TILE_PX, _FEWEST_TILES = 64, 8  # squares whose power spectra are taken, and how many of them tell motion
 _MOST_TILES = 256  # more take time, and tell hardly more
 _LEAST_DN = 0.5  # standard deviation of grey values in such a square
@@ -52,11 +66,19 @@ class Alteration:
     reason : what it is, what it does to marks, and what to do.
     cause : of the part of each mark's covariance that stands for it.
     px2 : (2, 2) that part.
+    pixels : number of pixels that are worth one: that part has the mark's own covariance as often, less once.
+    doubt : why no mark is more than weak; empty if that part says it all.
     """
 
     reason: Reason
     cause: Cause
     px2: Array
+    pixels: float = 1.0
+    doubt: Reason = NO_REASON
+
+    def covariance(self, own_px2: Array) -> Array:
+        """(2, 2) part of a mark's covariance; own_px2: the rest of it."""
+        return self.px2 + (self.pixels - 1) * own_px2
 
 
 _NEAREST = Alteration(
@@ -68,6 +90,28 @@ _NEAREST = Alteration(
     Cause.INTERPOLATION,
     np.eye(2) / 12,  # errors are uniform over a pixel
 )
+_INTERPOLATED = Alteration(
+    Reason(
+        "The scan was enlarged or reduced by interpolation: its pixels are not independent, and standard deviations "
+        "are doubled. Measure the scan that it was made from.",
+        Code.IMPRECISE,
+    ),
+    Cause.INTERPOLATION,
+    np.zeros((2, 2)),
+    pixels=4.0,  # enlarged to twice the size; which scale it is the period leaves open
+    doubt=Reason("its scan was enlarged or reduced by interpolation", Code.IMPRECISE),
+)
+_SCREENED = Alteration(
+    Reason(
+        "A regular pattern lies over the whole scan, as the screen of a printed picture, and moves its marks: standard "
+        "deviations are doubled. Measure a scan of the film.",
+        Code.IMPRECISE,
+    ),
+    Cause.TEXTURE,
+    np.zeros((2, 2)),
+    pixels=4.0,  # errors of marks under screens of 4 to 11 px were twice their standard deviations
+    doubt=Reason("a regular pattern lies over its scan, as the screen of a printed picture", Code.IMPRECISE),
+)
 
 
 def find_alterations(scan: Scan) -> list[Alteration]:
@@ -75,9 +119,13 @@ def find_alterations(scan: Scan) -> list[Alteration]:
     strips = _strips(scan)
     if min(map(len, strips)) < _FEWEST_STEPS * _LEAST_DISTANCE_PX:
         return []
+    power = _power_spectrum(strips[0], strips[1].T)
+    motion = [] if power is None else _motion(power)
+    if power is not None and _is_screened(power):  # which makes rows periodic as well
+        return [_SCREENED, *motion]
     if _is_nearest_neighbour(*strips):
-        return [_NEAREST, *_motion(strips)]
-    return _motion(strips)
+        return [_NEAREST, *motion]
+    return [*([_INTERPOLATED] if _is_interpolated(strips) else []), *motion]
 
 
 def _strips(scan: Scan) -> tuple[Single, Single]:
@@ -93,7 +141,7 @@ def _strips(scan: Scan) -> tuple[Single, Single]:
 
 def _is_nearest_neighbour(rows: Single, columns: Single) -> bool:
     """Whether a scan was turned or enlarged with nearest neighbours, by strips of it."""
-    jumps, alike = (_jumps(rows), -_jumps(columns)), [-_roughness(each) for each in (rows, columns)]
+    jumps, alike = (_jumps(rows), -_jumps(columns)), [-_roughness(each, 1) for each in (rows, columns)]
     if any(_are_regular([sign * each for each in jumps]) for sign in (1, -1)):
         return True
     # Rows that stand twice are still alike after compression.
@@ -116,15 +164,17 @@ def _jumps(rows: Single) -> Array:
     return _standardised(better.mean(axis=1, dtype=float))
 
 
-def _roughness(rows: Single) -> Array:
-    """(n - 1,) logarithm of the mean difference of each row to the one before, in standard deviations."""
-    size = np.abs(np.diff(rows, axis=0)).mean(axis=1, dtype=float)
-    return _standardised(np.log(np.maximum(size, 1e-3)))
+def _roughness(rows: Single, order: int, around: int = _AROUND, most: float = np.inf) -> Array:
+    """(n - order,) logarithm of the mean difference of an order between rows, in standard deviations."""
+    size = np.abs(np.diff(rows, order, axis=0))
+    limit = most * np.median(size.mean(axis=1)) if most < np.inf else np.inf
+    size = np.minimum(size, limit).mean(axis=1, dtype=float)
+    return _standardised(np.log(np.maximum(size, 1e-3)), around)
 
 
-def _standardised(rows: Array) -> Array:
+def _standardised(rows: Array, around: int = _AROUND) -> Array:
     """(n,) values of rows less the median around, in limited standard deviations."""
-    beyond = rows - median_filter(rows, _AROUND)
+    beyond = rows - median_filter(rows, around)
     scaled = beyond / max(float(beyond.std()), np.finfo(float).tiny)
     return np.asarray(np.clip(scaled, -_MOST_SIGMAS, _MOST_SIGMAS))
 
@@ -159,15 +209,39 @@ def _regular_jump(jumps: Array, distance: float) -> float:
     return float(jumps[firsts[:, None] + np.arange(int(distance))].sum(axis=0).max() / np.sqrt(steps))
 
 
-def _motion(strips: tuple[Single, Single]) -> list[Alteration]:
+def _is_interpolated(strips: tuple[Single, Single]) -> bool:
+    """Whether the roughness of rows and columns has a common period, other than those of a grid of blocks."""
+    frequency = fft.rfftfreq(_PERIODS)
+    lines = np.array([_lines(each) for each in strips])
+    off_grid = np.abs(frequency * _BLOCK_PX - np.rint(frequency * _BLOCK_PX)) / _BLOCK_PX > _OFF_GRID
+    own = lines.min(axis=0)[off_grid & (frequency > _LOWEST)].max()
+    # A grid of blocks has a line at its own frequency, too.
+    eighth, fourth = lines[:, [_PERIODS // 8, _PERIODS // 4]].T
+    return bool(own > _STANDS_OUT or (fourth > np.maximum(_STANDS_OUT, _BEYOND_GRID * eighth)).all())
+
+
+def _lines(rows: Single) -> Array:
+    """(frequencies,) power of the roughness of rows by its frequency, over the median."""
+    roughness = _roughness(rows, 2, _CLOSELY_AROUND, _MOST_ROUGH)
+    power = np.abs(fft.rfft(roughness * np.hanning(len(roughness) + 2)[1:-1], _PERIODS)) ** 2
+    return np.asarray(maximum_filter1d(power, _ALL_NEAR) / max(float(np.median(power)), np.finfo(float).tiny))
+
+
+def _is_screened(power: Array) -> bool:
+    """Whether single lines stand out of a power spectrum."""
+    logarithms = np.log(power + _ROUNDING_DN2)
+    beyond = logarithms - median_filter(logarithms, _LINE_AROUND, mode="wrap")
+    col, row = np.abs(np.meshgrid(*2 * [fft.fftfreq(_TILE_PX)]))
+    lattice = (np.minimum(col, row) > 1.5 / _TILE_PX) & (np.hypot(col, row) > _COARSEST_SCREEN)  # no noise of rows
+    return bool(beyond[lattice].max() > _LINE)
+
+
+def _motion(power: Array) -> list[Alteration]:
     """Motion blur by the ratio of the power spectrum to itself a quarter turn on; empty without.
 
     The ratio is free of all that is alike in both directions: the lens, grain, compression. Its logarithm is a multiple
     of that of motion, plus smooth terms of second to sixth order.
     """
-    power = _power_spectrum(strips[0], strips[1].T)
-    if power is None:
-        return []
     frequency = fft.fftfreq(_TILE_PX)
     across = power.T[:, -np.arange(_TILE_PX)]  # at (-v, u)
     col, row = np.meshgrid(frequency, frequency)

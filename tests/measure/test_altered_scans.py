@@ -1,15 +1,15 @@
-"""Scans turned and scaled with nearest neighbours, by copying pixels of textures, and blurred by motion: found, and
-nothing else is."""
+"""Scans turned and scaled with nearest neighbours, by copying pixels of textures, enlarged, of prints, and blurred by
+motion: found, and nothing else is."""
 
 from functools import lru_cache
 
 import cv2
 import numpy as np
 import pytest
-from drawn import ALIKE, Array, center, frame_picture, make_scan, measure_grey, pixel_from_camera
+from drawn import ALIKE, PITCH_UM, Array, center, frame_picture, make_scan, measure_grey, pixel_from_camera
 from scipy.ndimage import convolve, gaussian_filter
 
-from measure import Code, Status
+from measure import Code, Status, measure_fiducials
 from measure.flags import Cause
 from measure.noise.resampling import find_alterations
 
@@ -67,6 +67,40 @@ def test_nearest_neighbours_are_found_under_compression() -> None:
     assert causes(jpeg(nearest(film(), 0.0, (1.012, 1.012)), 90)) == [Cause.INTERPOLATION]
 
 
+@pytest.mark.parametrize("kind", [cv2.INTER_LINEAR, cv2.INTER_CUBIC])
+@pytest.mark.parametrize("scale", [1.2, 4 / 3, 1.5])
+def test_enlarged_scans_are_found(scale: float, kind: int) -> None:
+    enlarged = cv2.resize(film(), None, fx=scale, fy=scale, interpolation=kind)
+    (found,) = find_alterations(make_scan(np.rint(enlarged), 255))
+    assert (found.cause, found.pixels) == (Cause.INTERPOLATION, 4.0)
+
+
+def print_screen(light: Array, period_px: float) -> Array:
+    """Soft dots of a screen at 45 degrees, the larger the more light (0 to 1) there is, as grey values."""
+    col, row = np.meshgrid(*map(np.arange, light.shape[::-1]))
+    waves = [np.cos(2 * np.pi * (col + sign * row) / period_px) for sign in (1, -1)]
+    return np.asarray(255 / (1 + np.exp(-12 * (light - 0.5 - 0.25 * (waves[0] + waves[1])))))
+
+
+@pytest.mark.parametrize("period_px", [4.0, 6.0, 7.5, 8.0])
+def test_screens_of_prints_are_found(period_px: float) -> None:
+    (found,) = find_alterations(make_scan(gaussian_filter(print_screen(film() / 255, period_px), 0.8), 255))
+    assert "screen" in found.reason
+    assert (found.cause, found.pixels) == (Cause.TEXTURE, 4.0)
+
+
+def test_marks_of_a_print_are_weak_and_lie_within_what_its_dots_make_uncertain() -> None:
+    matrix = pixel_from_camera("0")
+    picture = print_screen(frame_picture(ALIKE, matrix) / 16000 + 0.15, 6.0)
+    result = measure_grey(np.rint(100 * gaussian_filter(picture, 0.8)), ALIKE)
+    assert [Code.IMPRECISE in problem.codes for problem in result.problems] == [True]
+    for mark, given in zip(result.marks, ALIKE.marks, strict=True):
+        assert mark.status is Status.WEAK
+        assert mark.covariance is not None
+        off = center(mark) - matrix @ (*given.xy_mm, 1.0)
+        assert off @ np.linalg.solve(mark.covariance.px2, off) < 9
+
+
 @pytest.mark.parametrize(
     ("length_px", "slope", "named"),
     [(3, (1, 0), "3 px along rows"), (5, (0, 1), "5 px along columns"), (5, (1, -1), "to the right by 135 degrees")],
@@ -114,3 +148,16 @@ def test_marks_of_a_scan_blurred_by_motion_may_lie_anywhere_in_the_blur() -> Non
         assert mark.covariance is not None
         assert mark.covariance.parts[Cause.MOTION] == pytest.approx(np.diag([2.0, 0.0]), rel=0.1, abs=1e-9)
         assert np.abs(center(mark) - matrix @ (*given.xy_mm, 1.0)).max() < 1.0
+
+
+def test_standard_deviations_of_an_enlarged_scan_are_doubled_and_its_marks_weak() -> None:
+    matrix, random = pixel_from_camera("0"), np.random.default_rng(7)
+    picture = frame_picture(ALIKE, matrix)
+    enlarged = cv2.resize(picture + random.normal(0.0, 3.0, picture.shape), None, fx=1.1, fy=1.1)
+    result = measure_fiducials(make_scan(np.rint(enlarged)), ALIKE, (PITCH_UM / 1.1, PITCH_UM / 1.1))
+    assert [Code.IMPRECISE in problem.codes for problem in result.problems] == [True]
+    for mark in result.marks:
+        assert mark.status is Status.WEAK
+        assert "interpolation" in mark.reason
+        assert mark.covariance is not None
+        assert mark.covariance.parts[Cause.INTERPOLATION] == pytest.approx(0.75 * mark.covariance.px2)
