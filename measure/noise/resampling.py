@@ -48,8 +48,9 @@ _COARSEST_SCREEN = 0.08  # per pixel: coarser ones are single dots to a mark
 _TILE_PX, _FEWEST_TILES = 64, 8  # squares whose power spectra are taken, and how many of them tell motion
 _MOST_TILES = 256  # more take time, and tell hardly more
 _LEAST_DN = 0.5  # standard deviation of grey values in such a square
-_ROUNDING_DN2 = 1 / 12  # variance of rounding, which fills the zeros of a spectrum
+_ROUNDING_DN2 = 1 / 12  # variance of rounding, the least noise
 _SIGNAL_DN2 = 12 * _ROUNDING_DN2  # least power along or across the motion, to compare both
+_OF_NOISE = 0.01  # quantile of the power that is noise: less is chance, more has some of the picture
 _LEAST_FREQUENCIES = 100
 _LENGTHS_PX, _TURNS = np.arange(3.0, 9.5, 0.5), np.arange(12) * np.pi / 12  # motions that are tried
 _MOVED = 0.42  # exponent with which motion stands in the spectrum, 1 for motion alone; film without motion: 0.37
@@ -250,7 +251,8 @@ def _motion(power: Array) -> list[Alteration]:
     used = plain & (radius > 4 / _TILE_PX) & (radius < 0.5) & (signal > _SIGNAL_DN2)
     if used.sum() < _LEAST_FREQUENCIES:
         return []
-    u, v, floor = col[used], row[used], np.maximum(_ROUNDING_DN2 / signal[used], 0.003)
+    noise_dn2 = max(_ROUNDING_DN2, float(np.quantile(power[plain], _OF_NOISE)))  # which fills the zeros
+    u, v, floor = col[used], row[used], np.maximum(noise_dn2 / signal[used], 0.003)
     squares, smooth = u**2 + v**2, np.stack([u**2 - v**2, u * v])
     smooth = np.concatenate([smooth, smooth * squares, smooth * squares**2])
     basis = np.linalg.qr(smooth.T)[0]
