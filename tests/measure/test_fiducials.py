@@ -1,6 +1,7 @@
 """Fiducial marks of whole frames drawn by brute force: the right names in every pose, and honest words where not."""
 
 from dataclasses import replace
+from typing import Literal
 
 import drawn as draw
 import numpy as np
@@ -8,9 +9,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
-from measure import Code, FiducialOptions, MarkShape, Status, dot, polygon, ring_cross
+from measure import Code, FiducialLayout, FiducialOptions, MarkShape, Status, dot, polygon, ring_cross
 from measure.fiducials.measure_frame import rename_frame
+from measure.fiducials.measurement import absent_frame
 from measure.fiducials.stages import find_frame
+from measure.flags import Reason
 from measure.geometry import POSES
 from measure.marks.shapes import Disk, Part, finest_detail_mm
 
@@ -154,11 +157,25 @@ def test_dark_marks_and_an_unknown_pitch() -> None:
     draw.assert_right(result, draw.NUMBERED, matrix)
 
 
-def test_a_negative_of_light_marks_is_named() -> None:
+@pytest.mark.study
+def test_no_frame_is_found_in_a_negative_of_light_marks() -> None:
     negative = 20000 - draw.frame_picture(draw.NUMBERED, draw.pixel_from_camera("0"))
-    light = [replace(mark, mark=replace(mark.mark, polarity="light")) for mark in draw.NUMBERED.marks]
-    lost = draw.measure_grey(negative, replace(draw.NUMBERED, marks=tuple(light)), FiducialOptions(pose="0"))
-    assert 'no negative of what the camera file draws (polarity = "auto" takes both)' in lost.problems[0]
+    lost = draw.measure_grey(negative, polarised("light"), FiducialOptions(pose="0"))
+    assert {mark.status for mark in lost.marks} == {Status.ABSENT}
+    assert "no negative of what" in lost.problems[0]
+
+
+def test_a_negative_is_named_where_marks_have_a_polarity() -> None:
+    scan = draw.make_scan(np.full((60, 60), 20000.0))
+    words = 'no negative of what the camera file draws (polarity = "auto" takes both)'
+    for polarity, is_named in (("light", True), ("auto", False)):
+        (problem,) = absent_frame(scan, polarised(polarity), Reason("none was found"), 6.0, None).problems
+        assert (words in problem) == is_named
+
+
+def polarised(polarity: Literal["light", "auto"]) -> FiducialLayout:
+    marks = (replace(mark, mark=replace(mark.mark, polarity=polarity)) for mark in draw.NUMBERED.marks)
+    return replace(draw.NUMBERED, marks=tuple(marks))
 
 
 def test_zero_marks_give_no_silent_identity() -> None:
