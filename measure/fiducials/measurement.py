@@ -325,7 +325,7 @@ def present_frame(
         places = zip(frame.layout.marks, frame.detections, frame.predicted_px, strict=True)
         marks = tuple(_unmeasured(mark.id, each, place, doubt) for mark, each, place in places)
         return FrameMeasurement(frame.scan.name, marks, pose, problems=tuple(problems), weights=frame.weights)
-    for altered in find_alterations(frame.scan):
+    for altered in find_alterations(frame.scan, frame.weights if frame.channel_note else None):
         own_px2 = (np.zeros((2, 2)) if each.fit is None else each.fit.covariance_px2 for each in frame.detections)
         parts = ({altered.cause: altered.covariance(px2)} for px2 in own_px2)
         detections = (each.amend(parts=part) for each, part in zip(frame.detections, parts, strict=True))

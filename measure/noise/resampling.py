@@ -115,9 +115,12 @@ _SCREENED = Alteration(
 )
 
 
-def find_alterations(scan: Scan) -> list[Alteration]:
-    """Find what was done to a whole scan and makes the places of its marks uncertain."""
-    strips = _strips(scan)
+def find_alterations(scan: Scan, weights: tuple[float, ...] | None = None) -> list[Alteration]:
+    """Find what was done to a whole scan and makes the places of its marks uncertain.
+
+    weights: of the channels; None: luminance. Channels that do not coincide are no motion.
+    """
+    strips = _strips(scan, weights)
     if min(map(len, strips)) < _FEWEST_STEPS * _LEAST_DISTANCE_PX:
         return []
     power = _power_spectrum(strips[0], strips[1].T)
@@ -129,15 +132,15 @@ def find_alterations(scan: Scan) -> list[Alteration]:
     return [*([_INTERPOLATED] if _is_interpolated(strips) else []), *motion]
 
 
-def _strips(scan: Scan) -> tuple[Single, Single]:
+def _strips(scan: Scan, weights: tuple[float, ...] | None) -> tuple[Single, Single]:
     """Strips of the scan through its centre: rows, and columns transposed."""
     sides = scan.width_px, scan.height_px
     wide, tall = (min(side, _LONG_PX) for side in sides)
     broad = min(wide, tall, _WIDE_PX)
     # From multiples of the width, those of tiles: a strip across two rows of them would decode both.
     left, top = ((side - broad) // 2 // broad * broad for side in sides)
-    columns = scan.window((scan.width_px - wide) // 2, top, wide, broad).T
-    return scan.window(left, (scan.height_px - tall) // 2, broad, tall), columns
+    columns = scan.window((scan.width_px - wide) // 2, top, wide, broad, weights).T
+    return scan.window(left, (scan.height_px - tall) // 2, broad, tall, weights), columns
 
 
 def _is_nearest_neighbour(rows: Single, columns: Single) -> bool:
