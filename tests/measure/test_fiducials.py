@@ -168,8 +168,8 @@ def test_no_frame_is_found_in_a_negative_of_light_marks() -> None:
 def test_a_negative_is_named_where_marks_have_a_polarity() -> None:
     scan = draw.make_scan(np.full((60, 60), 20000.0))
     words = 'no negative of what the camera file draws (polarity = "auto" takes both)'
-    for polarity, is_named in (("light", True), ("auto", False)):
-        (problem,) = absent_frame(scan, polarised(polarity), Reason("none was found"), 6.0, None).problems
+    for layout, is_named in ((polarised("light"), True), (polarised("auto"), False)):
+        (problem,) = absent_frame(scan, layout, Reason("none was found"), 6.0, None).problems
         assert (words in problem) == is_named
 
 
