@@ -84,7 +84,7 @@ def process() -> int:
 
 
 def test_a_killed_process_is_replaced_and_its_task_begun_again(tmp_path: Path) -> None:
-    with worker_pool(2, workers=2) as pool:
+    with worker_pool(2, workers=1) as pool:
         others = [pool.submit(square, number) for number in range(6)]
         assert pool.submit(killed_times, 1, tmp_path, 7).result(60) == 7
         assert [other.result(60) for other in others] == [0, 1, 4, 9, 16, 25]
