@@ -32,7 +32,7 @@ from measure.marks.shapes import (
     limit_to_frame,
 )
 from measure.matching.covariance import honest_covariance
-from measure.noise.resampling import find_alterations
+from measure.noise.scan_alterations import find_alterations
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
 from measure.scans.scan import Scan
 

@@ -263,8 +263,14 @@ def test_coordinates_that_the_program_chooses_are_held_where_they_are_given(heig
     network, start = simulated(np.random.default_rng(5), point_sigma=np.inf)
     points = tuple(replace(p, Z=replace(p.Z, sigma=heights)) for p in network.points if p.Z is not None)
     network = replace(network, points=points)
-    larger = {name: xyz * [1.02, 1.02, 1.02 if heights else 1.0] for name, xyz in start.points.items()}
-    result = adjust(network, replace(start, points=larger), Options(datum="minimal"))
+    scale = 30.0 if heights else 1.0  # in another unit, and aside, where nothing fixes that
+    points_there = {name: scale * xyz + [1e4, 0.0, 0.0] for name, xyz in start.points.items()}
+    stations_there = {
+        name: np.concatenate([scale * values[:3] + [1e4, 0.0, 0.0], values[3:]])
+        for name, values in start.exterior.items()
+    }
+    result = adjust(network, replace(start, points=points_there, exterior=stations_there), Options(datum="minimal"))
+    assert result.converged
     given = {
         f"PT.{p.id}.{axis}": prior.value for p in points for axis, prior in zip("XYZ", p.priors, strict=True) if prior
     }

@@ -11,7 +11,7 @@ from scipy.ndimage import convolve, gaussian_filter
 
 from measure import Code, Status, measure_fiducials
 from measure.flags import Cause
-from measure.noise.resampling import find_alterations
+from measure.noise.scan_alterations import find_alterations
 
 SIDE = 700
 

@@ -1,4 +1,4 @@
-"""Scans altered as a whole before they came, told by what this leaves everywhere: nearest neighbours, interpolation,
+"""Alterations of a whole scan before it came, found by what they leave everywhere: nearest neighbours, interpolation,
 screens of prints, and motion.
 
 Turned or scaled with nearest neighbours, every pixel was copied from the nearest one of the source. Under a small turn
