@@ -227,15 +227,23 @@ def _too_large(adjustment: AdjustmentRecord) -> Iterator[ReportedProblem]:
     size = (
         f"{_sigma0_and('above', high, adjustment.sigma0)}: the residuals are larger than the standard deviations given"
     )
+    is_calibrated = any(camera.is_calibrated for camera in adjustment.cameras.values())
+    noise = "film_sigma_um" if "fiducial" in adjustment.groups else 'unmodelled = "estimate"'
     if explained:
         yield replace(explained[0], what=f"{size}. {explained[0].what}")
         yield from explained[1:]
+        left = min(each.sigma0[1] for each in adjustment.explanations)
+        if left > high:
+            yield ReportedProblem(
+                f"σ₀ = {left:.3g} remains with that in the model.",
+                f"Mend that first; if σ₀ stays large, state {noise} under [adjust] for what the model lacks.",
+                section="reliability",
+            )
         return
-    is_calibrated = any(camera.is_calibrated for camera in adjustment.cameras.values())
     model = "add distortion parameters" if is_calibrated else "choose a richer film transformation"
     yield ReportedProblem(
         f"{size} ({_group_sigmas(adjustment)}).",
-        f"Reject gross errors first; then {model}, or state film_sigma_um. All σ are already multiplied by σ₀.",
+        f"Reject gross errors first; then {model}, or state {noise} under [adjust]. All σ are multiplied by σ₀.",
         section="reliability",
     )
 

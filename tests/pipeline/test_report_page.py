@@ -366,6 +366,7 @@ def test_good(adjusted_data: ReportData) -> None:
 
 
 NOT_SQUARE = (Explanation("pixels", "The pixels are not square.", "Give b1.", 1e-9, (1.6, 1.0)),)
+PARTLY = (replace(NOT_SQUARE[0], sigma0=(9.6, 4.2)),)
 
 
 @pytest.mark.parametrize(
@@ -374,6 +375,7 @@ NOT_SQUARE = (Explanation("pixels", "The pixels are not square.", "Give b1.", 1e
         ({"sigma0": 1.6}, ["σ₀ = 1.60 is above 1.11", "film_sigma_um", "(target 1.02, fiducial 0.97)"]),
         ({"sigma0": 1.6, "explanations": NOT_SQUARE}, ["deviations given. The pixels are not square. Give b1."]),
         ({"explanations": NOT_SQUARE}, ["The pixels are not square. Give b1."]),
+        ({"sigma0": 9.6, "explanations": PARTLY}, ["Give b1.", "σ₀ = 4.2 remains with that", "state film_sigma_um"]),
         ({"warnings": ("c is carried by its prior.",)}, ["c is carried by its prior."]),
     ],
 )
@@ -381,6 +383,7 @@ def test_what_the_adjustment_finds_is_a_problem(adjusted_data: ReportData, value
     text = describe(changed(adjusted_data, **values))
     assert [word for word in words if word not in text] == []
     assert "gross errors" not in text or "explanations" not in values
+    assert ("remains" in text) == (values.get("explanations") == PARTLY)
 
 
 def suspect(**values: Any) -> tuple[SuspectRecord]:
