@@ -80,7 +80,7 @@ _STEPS_DN = np.arange(2, 51)  # a step of 1 changes nothing; 50 is that of quali
 _BIN_DN = 0.25  # of coefficients: a tenth of the coarser steps
 _LARGEST_DN = 150.0  # largest coefficient used: three times the largest step
 _LOST_PX = 0.25  # px, times (step / contrast)²: rms error that residuals do not contain (benchmarks/marks.py)
-_TONE_LOST = 3.5  # times step / contrast: error of a departure, in prior standard deviations (benchmarks/tone_said.py)
+_TONE_LOST = 3.5  # times step / contrast: error of a departure, in prior standard deviations (benchmarks/RESULTS.md)
 _MOST_LOST_PX = 1.0  # px, limit of that error: with a contrast of two steps there is nothing left to measure
 
 
