@@ -306,7 +306,8 @@ class _Run:
         write_adjustment(adjustment, path, adjusted_from(project, marks), frames_mm)
 
     def write_check(self, adjustment: Adjustment) -> None:
-        from pipeline.opencv_check.check import BoardPictures, check_against_opencv, detector_name
+        from pipeline.opencv_check.board_corners import BoardPictures, detector_name
+        from pipeline.opencv_check.check import check_against_opencv
 
         project, path, pictures = self.project, self.project.adjustment_path, None
         board = project.targets.board if project.targets else None

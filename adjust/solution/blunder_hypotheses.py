@@ -16,6 +16,7 @@ from adjust.array_types import Array
 from adjust.functional_model.lens import Prior
 from adjust.problem.network import Network, ObjectPoint
 from adjust.problem.parameter import shortened
+from adjust.solution.explanations import CHECKED
 from adjust.solution.given_orientations import (
     AXES,
     CLEARLY,
@@ -32,7 +33,6 @@ from adjust.solution.given_orientations import (
 from adjust.solution.result import Adjustment
 from adjust.solution.wrong_names import LARGE, NAMED, transformed_fields
 
-CHECKED = 10  # smallest redundancy for an explanation
 WORST, RARE = 3, 1e-3  # frames of a camera tried with another one; ratio of likelihoods to be exceeded by one trial
 MOST_PAIRS = 15  # pairs of frames tried as exchanged, largest residuals first
 ONE_AXIS = 10.0  # sigma0 that one axis in another unit leaves at least

@@ -30,7 +30,13 @@ from pipeline.calibration.intrinsics import (
     camera_intrinsics,
     choose_lens,
 )
-from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures, find_turns
+from pipeline.calibration.pictures import (
+    FEWEST_PICTURES,
+    BoardPictureFiles,
+    CameraPictures,
+    find_pictures,
+    find_turns,
+)
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.progress import Reporter
@@ -44,7 +50,6 @@ from pipeline.workers import WorkOptions
 
 GENEROUS = 2.0  # factor on the unmodelled standard deviation, for lens models with larger misfit than the first
 FEWEST_CORNERS = 4  # corners for a space resection with redundancy
-FEWEST_PICTURES = 3  # images of a flat board needed for principal distance and principal point
 
 OUT = Path("calibration")
 LENSES: dict[str, LensSetting] = {"auto": "auto", **{model: model for model in get_args(LensModel)}}

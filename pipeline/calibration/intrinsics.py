@@ -31,7 +31,7 @@ PARAMETERS: dict[LensModel, tuple[str, ...]] = {
     "fisheye": ("k1", "k2", "k3", "k4"),
 }  # each but the last extends the one before
 FOLDS = 5
-FEWEST_PICTURES = 6  # images needed for the cross-validation
+FEWEST_VALIDATED = 6  # images needed for the cross-validation
 WIDE = 1.0  # half the image's diagonal over the principal distance, above which a fisheye is tried: 45 degrees
 HIGHLY_CORRELATED = 0.9  # from which a correlation is listed
 ONE_UNKNOWN = 1.0 - 1e-9  # correlation of fx and fy of square pixels
@@ -72,7 +72,7 @@ def choose_lens(
     adjusted : adjusts a network, from initial values if given
     start : values of an adjustment with the first model
     """
-    if len(network.images) < FEWEST_PICTURES:
+    if len(network.images) < FEWEST_VALIDATED:
         return LensChoice("opencv4", {})
     squares: dict[LensModel, Array | None] = {}
     best: LensModel = "opencv4"

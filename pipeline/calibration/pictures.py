@@ -33,7 +33,7 @@ _Kind = tuple[int, int, float | None]  # width, height, focal length
 QUARTERS_DEG = (90, 270)
 TURNS_BY_TAG = {6: 90, 8: 270}  # Exif's Orientation of images that viewers turn back
 PLAIN = 20.0  # twice the log-likelihood ratio; odds of e to the 10
-FEWEST_PICTURES = 3  # images with known turns needed to determine the lens
+FEWEST_PICTURES = 3  # of a flat board with known turns, needed for principal distance and principal point
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ from pipeline.calibration.intrinsics import LensChoice, LensModel, choose_lens
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures
 from pipeline.calibration.project_files import CalibrationOptions, board_options, check_folder, write_project
 from pipeline.files.target_table import read_targets
-from pipeline.opencv_check.check import BoardPictures, compare_corners, detector_name, find_points
+from pipeline.opencv_check.board_corners import BoardPictures, compare_corners, detector_name, find_points
 from pipeline.opencv_check.opencv_calibration import NAMES, Freedom, OpenCvCalibration, OpenCVPoints, calibrate
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.measured_record import MeasuredScan
