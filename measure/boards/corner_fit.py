@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from measure.array_types import Array, Indices, Integers, Mask, Single
 from measure.boards.edge_curvature import edge_curvatures
 from measure.flags import NO_REASON, Cause, Code, Reason
-from measure.matching.gauss_newton import UNDETERMINED, UNSETTLED
+from measure.matching.gauss_newton import FitModel, gauss_newton
 from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.matching.window import ScanWindow
 from measure.noise.noise_model import covariance_along, influence_covariances
@@ -201,8 +201,10 @@ def fit_corners(
     return _CornerFits(windows, starts, surface, quantisation_step_dn, first_block_px).run()
 
 
-class _CornerFits:
+class _CornerFits(FitModel):
     """Adjustments of n corners in progress. Arrays over pixels are (n, p): p candidate pixels of each corner."""
+
+    damping = _DAMPING
 
     def __init__(
         self,
@@ -212,6 +214,7 @@ class _CornerFits:
         quantisation_step_dn: float,
         first_block_px: tuple[int, int],
     ) -> None:
+        super().__init__(len(starts))
         self.windows, self.surface = windows, surface
         self.quantisation_step_dn, self.first_block_px = quantisation_step_dn, np.array(first_block_px)
         self.origin = np.array([window.origin_px for window in windows], float)
@@ -236,7 +239,7 @@ class _CornerFits:
         self._choose_pixels()
         self.residuals = np.zeros(self.grey.shape, np.float32)
         self.design = np.zeros((len(starts), self.unknowns, self.grey.shape[1]), np.float32)
-        self.weights = self._area(np.arange(len(starts)))
+        self.weights, self.scale = self._area(self.every), np.full(len(starts), np.inf)
         outside = Reason("too little of it is inside of the scan", Code.OUTSIDE)
         self.reasons = [NO_REASON if each.sum() > 2 * self.unknowns else outside for each in self.weights]
 
@@ -263,35 +266,24 @@ class _CornerFits:
     def run(self) -> list[Corner]:
         """Adjust by plain, then robust least squares until the corners converge; sets a reason for those that do
         not."""
-        scale = np.full(len(self.windows), np.inf)
-        self._linearise(np.arange(len(self.windows)), is_first=True)
+        self._linearise(self.every, is_first=True)
         for stage, tolerance_px in enumerate(_STAGES_TOLERANCE_PX):
             moving = np.array([number for number, reason in enumerate(self.reasons) if not reason], np.intp)
             if stage == 1:  # take the curvature of the edges from the corners as they are fitted so far
                 fits = np.array([not reason for reason in self.reasons])
                 centers_px = np.where(fits[:, None], self.center + self.origin, np.nan)
-                self.curvatures = edge_curvatures(centers_px, self.board, self._normals(np.arange(len(fits))))
+                self.curvatures = edge_curvatures(centers_px, self.board, self._normals(self.every))
             if stage:
                 floor = _SCALE_FLOOR * 2 * np.abs(self.linear[moving, 0])
                 robust = [robust_scale(self.residuals[number, self.weights[number] > 0]) for number in moving]
-                scale[moving] = np.maximum(np.maximum(robust, floor), 1e-9)
-            for _ in range(_MAX_ITERATIONS):
-                if not len(moving):
-                    break
-                lengths_px = self._step(moving, scale[moving])
-                self._linearise(moving)
-                moving = moving[(lengths_px >= tolerance_px) & [not self.reasons[number] for number in moving]]
-            self._refuse(moving, UNSETTLED)
+                self.scale[moving] = np.maximum(np.maximum(robust, floor), 1e-9)
+            gauss_newton(self, moving, tolerance_px, _MAX_ITERATIONS)
         return self._corners()
-
-    def _refuse(self, numbers: Indices, reason: Reason) -> None:
-        for number in numbers:
-            self.reasons[number] = self.reasons[number] or reason
 
     def _corners(self) -> list[Corner]:
         """Assemble the corners, with covariances from the autocovariance of the residuals, and junctions."""
         design, residuals = self.design, self.residuals
-        area, used = self._area(np.arange(len(self.windows))), self.weights > _UNDAMAGED
+        area, used = self._area(self.every), self.weights > _UNDAMAGED
         used &= design[:, _SHAPE_UNKNOWNS + 1] != 0  # the offset's derivative is 0 for clipped pixels only
         influence = self._pictures(place_influences(design, self.weights))
         covariances, variances = influence_covariances(
@@ -309,7 +301,7 @@ class _CornerFits:
         covariances[fails], noise_dn = np.inf, np.where(fails, np.nan, np.sqrt(variances))
         rounding_dn = np.finfo(np.float32).eps * np.abs(self.linear[:, 1])  # for a uniform window without noise
         faint = ~fails & ~(np.abs(self.linear[:, 0]) > 2 * np.maximum(noise_dn, rounding_dn))
-        self._refuse(np.flatnonzero(faint), Reason("no edges stand out from the noise", Code.CONTRAST))
+        self.refuse(np.flatnonzero(faint), Reason("no edges stand out from the noise", Code.CONTRAST))
         junctions_px = np.full((len(self.windows), 2), np.nan)
         if self.bends:  # damaged pixels are replaced by the model
             damage = self._pictures(np.where(self.weights < _UNDAMAGED * area, residuals, np.float32(0.0)))
@@ -383,7 +375,7 @@ class _CornerFits:
         if self.bends:
             grey[:, 4] = value**2 - 1
         if is_first:
-            self.linear[:] = gauss_newton_step(grey, self.grey, self.weights, _GREY_DAMPING)
+            self.linear[:] = np.nan_to_num(gauss_newton_step(grey, self.grey, self.weights, _GREY_DAMPING))
         linear = self.linear[numbers].astype(np.float32)
         slope = linear[:, :1] + (2 * linear[:, 4:] * value if self.bends else np.float32(0.0))
         by_u, by_v, by_correlation = by_u * slope, by_v * slope, by_correlation * slope
@@ -399,30 +391,30 @@ class _CornerFits:
         informative = self.ends[numbers] * residuals >= 0
         self.design[numbers], self.residuals[numbers] = design * informative[:, None], residuals * informative
 
-    def _step(self, numbers: Indices, scale: Array) -> Array:
-        """Apply a Gauss-Newton step, shortened to the range of the linearisation. Returns (m,) lengths in px."""
-        design, residuals = self.design[numbers], self.residuals[numbers]
-        relative = np.asarray(residuals / scale[:, None], np.float32)
-        self.weights[numbers] = weights = np.asarray(self._area(numbers) * tukey_weights(relative, 1.0), np.float32)
-        shown = (np.abs(design) @ weights[..., None])[..., 0] > 0
-        step = gauss_newton_step(design, residuals, weights, _DAMPING)
-        turn = np.abs(step[:, 2:4]).max(axis=1) / _LONGEST_TURN_RAD
-        step /= np.maximum(np.maximum(np.hypot(step[:, 0], step[:, 1]), turn), 1.0)[:, None]
-        step[~shown.all(axis=1)] = 0.0
-        self.center[numbers] += step[:, :2]
-        self.edges[numbers] += step[:, 2:4]
-        self.linear[numbers] += step[:, _SHAPE_UNKNOWNS:]
-        before = self.variance[numbers]
-        variance = np.clip(before + step[:, 4], before / 2, before * 2)
-        self.variance[numbers] = np.clip(variance, _LEAST_BLUR_PX**2, self.max_variance[numbers])
-        self._refuse(numbers[~shown.all(axis=1)], UNDETERMINED)
+    def weights_of(self, fits: Indices) -> Single:
+        """Tukey's weights in the area around each corner."""
+        relative = np.asarray(self.residuals[fits] / self.scale[fits, None], np.float32)
+        self.weights[fits] = np.asarray(self._area(fits) * tukey_weights(relative, 1.0), np.float32)
+        return np.asarray(self.weights[fits])
+
+    def step(self, fits: Indices, steps: Array) -> Array:
+        """Apply steps, shortened to the range of the linearisation. Returns (m,) lengths in px."""
+        turn = np.abs(steps[:, 2:4]).max(axis=1) / _LONGEST_TURN_RAD
+        steps = steps / np.maximum(np.maximum(np.hypot(steps[:, 0], steps[:, 1]), turn), 1.0)[:, None]
+        self.center[fits] += steps[:, :2]
+        self.edges[fits] += steps[:, 2:4]
+        self.linear[fits] += steps[:, _SHAPE_UNKNOWNS:]
+        before = self.variance[fits]
+        variance = np.clip(before + steps[:, 4], before / 2, before * 2)
+        self.variance[fits] = np.clip(variance, _LEAST_BLUR_PX**2, self.max_variance[fits])
         away = np.linalg.norm(self.center - self.start, axis=1) > self.max_shift_px
         turned = np.abs(self.edges - self.start_edges).max(axis=1) > _MOST_TURN_RAD
-        self._refuse(numbers[away[numbers]], Reason("the fit did not stay at this corner", Code.NO_FIT))
-        self._refuse(
-            numbers[turned[numbers]], Reason("the edges here have other directions than those of the board", Code.SIZE)
+        self.refuse(fits[away[fits]], Reason("the fit did not stay at this corner", Code.NO_FIT))
+        self.refuse(
+            fits[turned[fits]], Reason("the edges here have other directions than those of the board", Code.SIZE)
         )
-        return np.hypot(step[:, 0], step[:, 1])
+        self._linearise(fits)
+        return np.hypot(steps[:, 0], steps[:, 1])
 
 
 def junctions(greys: NDArray[np.floating], starts_px: Array, reach_px: float) -> Array:

@@ -9,18 +9,21 @@ A wrong tone curve leaves the same residuals in all profiles; their scatter give
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
+from typing import Self
 
 import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.special import erf
 
-from measure.array_types import Array, Mask
+from measure.array_types import Array, Indices, Mask
 from measure.flags import NO_REASON, Code, Reason
 from measure.marks.shapes import FrameCorner
+from measure.matching.gauss_newton import FitModel, gauss_newton
 from measure.matching.window import FAINT, Coding
-from measure.noise.robust_estimation import gauss_newton_step, tukey_fit
+from measure.noise.robust_estimation import tukey_fit
 from measure.results import Covariance, MarkFit
 from measure.scans.scan import Scan
 from measure.tone.curve import ToneInformation
@@ -33,7 +36,7 @@ _ABOUT_PX = 5.0  # px on either side of the line, enough for an edge under any u
 _STEP_PX = 0.5  # px, sampling interval across the edge
 _SMOOTH_PX = 1.5  # px, smoothing across the edge before differentiation
 _TILT = 0.02  # rad, search range of the edge's direction around the predicted one
-_ITERATIONS, _DAMPING = 12, 1e-9  # Gauss-Newton steps of the profiles' fit, and their damping
+_ITERATIONS, _SETTLED_PX, _DAMPING = 12, 1e-4, 1e-9  # Gauss-Newton steps of the profiles, last one, and their damping
 _ROUNDS = 20  # iterations of the robust line, which converges after a few
 _START_BLUR_PX = 1.5  # px, typical of scans
 _RIM_PX = 2.0  # px: a step so near the end of a profile may belong to a different edge
@@ -124,50 +127,55 @@ def _straightest(grey: Array, along: Array, half: float) -> tuple[float, float]:
     return float(place * _STEP_PX - half - tilts[best] * middle), float(tilts[best])
 
 
-@dataclass(frozen=True, eq=False)
-class _Steps:
-    """Steps level + contrast * Phi((s - place) / blur) fitted to n profiles.
+class _Steps(FitModel):
+    """Steps ground + contrast * Phi((s - place) / blur) fitted to n profiles.
 
     place (px), contrast (light), stored_contrast (grey values of the file), blur (px), noise (light), likeness: (n,)
-    each; drawn, residuals: (n, samples) model and residuals; design: (n, 4, samples) derivatives.
+    each; drawn: (n, samples) model.
     """
 
-    place: Array
-    contrast: Array
-    stored_contrast: Array
-    blur: Array
-    noise: Array
-    likeness: Array
-    drawn: Array
-    residuals: Array
-    design: Array
+    damping = _DAMPING
 
-    @classmethod
-    def fit(cls, grey: Array, coding: Coding) -> "_Steps":
-        """Fit a step to every profile (n, samples) of light by Gauss-Newton. coding: of the scan."""
-        s = _samples(grey)
-        place, blur = np.zeros((len(grey), 1)), np.full((len(grey), 1), _START_BLUR_PX)
-        for rounds_left in range(_ITERATIONS, -1, -1):
-            z = (s - place) / blur
-            step = (1 + erf(z / np.sqrt(2))) / 2
-            slope = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) / blur
-            centred = step - step.mean(axis=1, keepdims=True)
-            squares = np.maximum((centred**2).sum(axis=1, keepdims=True), 1e-12)
-            contrast = (centred * grey).sum(axis=1, keepdims=True) / squares
-            residuals = grey - grey.mean(axis=1, keepdims=True) - contrast * centred
-            design = np.stack([-contrast * slope, -contrast * slope * z, step, np.ones_like(step)], axis=1)
-            if rounds_left:
-                change = gauss_newton_step(design, residuals, np.ones_like(residuals), _DAMPING)
-                place = place + np.clip(change[:, :1], -1.0, 1.0)
-                blur = np.clip(blur + np.clip(change[:, 1:2], -0.5, 0.5), *_BLUR_RANGE_PX)
-        noise = np.sqrt((residuals**2).mean(axis=1))
-        likeness = np.sqrt(np.clip(1 - (noise / np.maximum(grey.std(axis=1), 1e-12)) ** 2, 0.0, 1.0))
-        ground, contrast, drawn = (grey - contrast * step).mean(axis=1), contrast[:, 0], grey - residuals
-        stored = np.array(list(map(coding.stored_contrast_dn, ground.tolist(), contrast.tolist())))
-        return cls(place[:, 0], contrast, stored, blur[:, 0], noise, likeness, drawn, residuals, design)
+    def __init__(self, light: Array, coding: Coding) -> None:
+        """Fit a step to every profile (n, samples) of light. coding: of the scan."""
+        super().__init__(len(light))
+        self.light, self.place, self.contrast = light, np.zeros(len(light)), np.zeros(len(light))
+        self.blur = np.full(len(light), _START_BLUR_PX)
+        self.design, self.residuals = np.zeros((len(light), 4, light.shape[1])), np.zeros_like(light)
+        self.linearise(self.every)
+        gauss_newton(self, self.every, _SETTLED_PX, _ITERATIONS)
+        self.noise = np.sqrt((self.residuals**2).mean(axis=1))
+        self.likeness = np.sqrt(np.clip(1 - (self.noise / np.maximum(light.std(axis=1), 1e-12)) ** 2, 0.0, 1.0))
+        ground, self.drawn = (light - self.contrast[:, None] * self.design[:, 2]).mean(axis=1), light - self.residuals
+        self.stored_contrast = np.array(list(map(coding.stored_contrast_dn, ground.tolist(), self.contrast.tolist())))
 
-    def select(self, kept: Mask) -> "_Steps":
-        return _Steps(*(each[kept] for each in vars(self).values()))
+    def weights_of(self, fits: Indices) -> Array:
+        return np.ones_like(self.residuals[fits])
+
+    def step(self, fits: Indices, steps: Array) -> Array:
+        """Apply steps of limited length and linearise there."""
+        moves = np.clip(steps[:, 0], -1.0, 1.0)
+        self.place[fits] += moves
+        self.blur[fits] = np.clip(self.blur[fits] + np.clip(steps[:, 1], -0.5, 0.5), *_BLUR_RANGE_PX)
+        self.linearise(fits)
+        return np.abs(moves)
+
+    def linearise(self, fits: Indices) -> None:
+        """Compute contrast and ground by linear least squares, derivatives, and residuals."""
+        light, blur = self.light[fits], self.blur[fits, None]
+        z = (_samples(light) - self.place[fits, None]) / blur
+        step, slope = (1 + erf(z / np.sqrt(2))) / 2, np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) / blur
+        centred = step - step.mean(axis=1, keepdims=True)
+        squares = np.maximum((centred**2).sum(axis=1, keepdims=True), 1e-12)
+        contrast = (centred * light).sum(axis=1, keepdims=True) / squares
+        self.contrast[fits] = contrast[:, 0]
+        self.residuals[fits] = light - light.mean(axis=1, keepdims=True) - contrast * centred
+        self.design[fits] = np.stack([-contrast * slope, -contrast * slope * z, step, np.ones_like(step)], axis=1)
+
+    def select(self, kept: Mask) -> Self:
+        chosen = copy(self)
+        vars(chosen).update({name: each[kept] for name, each in vars(self).items() if isinstance(each, np.ndarray)})
+        return chosen
 
 
 def _samples(profiles: Array) -> Array:
@@ -202,7 +210,7 @@ def _find_edge(course: _Course, extent: tuple[float, float], search_px: float, p
         return None
     offset, slope = _straightest(near * polarity, middle, half)
     profiles, _ = course.profiles(middle, offset + slope * middle, share, _ABOUT_PX)
-    steps = _Steps.fit(profiles, Coding(course.scan.tone, course.scan.full_scale_dn))
+    steps = _Steps(profiles, Coding(course.scan.tone, course.scan.full_scale_dn))
     good = np.abs(steps.place) < _samples(profiles)[-1] - _RIM_PX
     good &= steps.stored_contrast * polarity > FAINT * course.scan.full_scale_dn
     good &= np.abs(steps.contrast) > _LEAST_SNR * steps.noise

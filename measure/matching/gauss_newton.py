@@ -1,12 +1,14 @@
-"""Gauss-Newton driver, and the adjustment of one mark in stages: plain, robust, damage masked, weighted by grain."""
+"""Gauss-Newton driver of all fits to images, and the adjustment of one mark in stages: plain, robust, damage masked,
+weighted by grain."""
 
 from dataclasses import replace
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from measure.array_types import Array, Mask
+from measure.array_types import Array, Indices, Mask
 from measure.flags import NO_REASON, Code, Reason
 from measure.marks.rendering import chip_mask, picture, true_mask
 from measure.marks.shapes import MarkTemplate
@@ -21,7 +23,15 @@ from measure.noise.noise_model import (
     may_be_noise,
     steadiness,
 )
-from measure.noise.robust_estimation import damage, dilate_mask, robust_scale, solution, tukey_loss, tukey_weights
+from measure.noise.robust_estimation import (
+    damage,
+    dilate_mask,
+    gauss_newton_step,
+    robust_scale,
+    solution,
+    tukey_loss,
+    tukey_weights,
+)
 
 UNSETTLED = Reason("the adjustment did not converge", Code.NO_FIT)
 UNDETERMINED = Reason("the picture does not determine the mark's place", Code.NO_FIT)
@@ -44,85 +54,97 @@ _GROUND = 0.1  # fraction of the mark's contrast: pixels that show less are back
 _OWN = 0.3  # fraction of the mark's contrast: pixels that show more are the mark
 
 
-class FitModel(Protocol):
-    """Model fitted to an image. It owns residuals, derivatives, weights and priors."""
+class FitModel:
+    """Fits of one model to n images, side by side. It owns their residuals, derivatives, weights and priors.
 
-    def solve(self) -> Array | None:
-        """Solve the normal equations at the current state. Returns the step (unknowns,), None if they are singular."""
-
-    def step(self, step: Array) -> float:
-        """Apply a step and linearise there. Returns the mark's movement in px."""
-
-    def failure(self) -> Reason:
-        """Reason why the current state is no solution; empty if it may be one."""
-
-
-@runtime_checkable
-class ReversibleModel(FitModel, Protocol):
-    """Model whose steps can be halved. state: replaced by each step."""
+    Attributes
+    ----------
+    reasons : why fits failed or did not converge; empty for the others.
+    state : replaced by each step, of a single fit whose steps can be halved.
+    design, residuals : (n, unknowns, pixels) and (n, pixels) at the current states.
+    damping : of the steps (`gauss_newton_step`).
+    """
 
     state: Any
+    design: NDArray[Any]
+    residuals: NDArray[Any]
+    damping = 0.0
+
+    def __init__(self, count: int) -> None:
+        self.reasons, self.every = [NO_REASON] * count, np.arange(count)
+
+    def weights_of(self, fits: Indices) -> NDArray[Any]:
+        """Weights (m, pixels) of m fits at their states."""
+        raise NotImplementedError
+
+    def solve(self, fits: Indices) -> Array:
+        """Solve the normal equations of m fits. Returns the steps (m, unknowns), nan if singular."""
+        return gauss_newton_step(self.design[fits], self.residuals[fits], self.weights_of(fits), self.damping)
+
+    def step(self, fits: Indices, steps: Array) -> Array:
+        """Apply the steps of m fits, linearise there, and give reasons. Returns the movements (m,) of the marks, px."""
+        raise NotImplementedError
 
     def cost(self) -> float:
-        """Objective function that the steps reduce."""
+        """Objective function that the steps of a single fit reduce."""
+        raise NotImplementedError
+
+    def refuse(self, fits: Indices, reason: Reason) -> None:
+        """Give this reason to the fits that have none yet."""
+        for number in fits:
+            self.reasons[number] = self.reasons[number] or reason
 
 
-class Outcome(NamedTuple):
-    """Outcome of the iteration. reason: why it did not converge, empty if it did; moved_px: length of the last step."""
-
-    reason: Reason
-    moved_px: float
-
-
-def gauss_newton(model: FitModel, tolerance_px: float, iterations: int, halvings: int = 0) -> Outcome:
-    """Iterate a model until a step is shorter than a tolerance.
+def gauss_newton(model: FitModel, fits: Indices, tolerance_px: float, iterations: int, halvings: int = 0) -> Array:
+    """Iterate some fits of a model, each until it moves less than a tolerance or fails.
 
     Parameters
     ----------
-    model : left at its last state.
-    tolerance_px : a shorter step ends the iteration.
+    model : left at its last state, with reasons for the fits that are singular or do not converge.
+    fits : (m,) their numbers.
     iterations : maximum number of steps.
-    halvings : maximum number of halvings of a step of a `ReversibleModel` that does not reduce the cost.
+    halvings : maximum number of halvings of a step that does not reduce the cost of a single fit.
 
     Returns
     -------
-    Outcome
+    (m,) last movements, px; infinite without a step.
     """
-    outcome = Outcome(UNSETTLED, np.inf)
-    reversible = model if halvings and isinstance(model, ReversibleModel) else None
+    moved_px, moving = np.full(len(fits), np.inf), np.arange(len(fits))
     for _ in range(iterations):
-        step = model.solve()
-        if step is None:
-            return Outcome(UNDETERMINED, outcome.moved_px)
-        if reversible is not None:
-            outcome = Outcome(UNSETTLED, _halved_step(reversible, step, tolerance_px, halvings))
-        else:
-            outcome = Outcome(UNSETTLED, model.step(step))
-        reason = model.failure()
-        if reason or outcome.moved_px < tolerance_px:
-            return Outcome(reason, outcome.moved_px)
-    return outcome
+        steps = model.solve(fits[moving])
+        is_regular = np.isfinite(steps).all(axis=1)
+        model.refuse(fits[moving[~is_regular]], UNDETERMINED)
+        moving, steps = moving[is_regular], steps[is_regular]
+        if len(moving):
+            own = fits[moving], steps
+            moved_px[moving] = _halved_step(model, *own, tolerance_px, halvings) if halvings else model.step(*own)
+        goes_on = [not model.reasons[number] for number in fits[moving]]
+        moving = moving[(moved_px[moving] >= tolerance_px) & np.array(goes_on, dtype=bool)]
+        if not len(moving):
+            break
+    model.refuse(fits[moving], UNSETTLED)
+    return moved_px
 
 
-def _halved_step(model: ReversibleModel, step: Array, tolerance_px: float, halvings: int) -> float:
+def _halved_step(model: FitModel, fits: Indices, steps: Array, tolerance_px: float, halvings: int) -> Array:
     """Apply a step, halved until it reduces the cost; none if no part does and the last one was short."""
     before, cost_before = model.state, model.cost()
-    moved_px = model.step(step)
+    moved_px = model.step(fits, steps)
     if moved_px < tolerance_px:
         return moved_px
     for _ in range(halvings):
         if model.cost() <= cost_before:
             return moved_px
-        step, model.state = step / 2, before
-        moved_px = model.step(step)
-    if model.cost() > cost_before and float(np.hypot(*step[:2])) < tolerance_px:
+        steps, model.state = steps / 2, before
+        moved_px = model.step(fits, steps)
+    if model.cost() > cost_before and float(np.hypot(*steps[0, :2])) < tolerance_px:
         # Size, blur and contrast are correlated here: the cost is flat at the minimum.
         model.state = before
-        return model.step(np.zeros_like(step))
+        return model.step(fits, np.zeros_like(steps))
     return moved_px
 
 
-class PictureFit:
+class PictureFit(FitModel):
     """Fit of a model to a window in progress.
 
     Attributes
@@ -137,12 +159,20 @@ class PictureFit:
     """
 
     def __init__(self, model: PictureModel, window: ScanWindow) -> None:
+        super().__init__(1)
         self.model, self.window, self.options = model, window, model.options
         self.area = self.used = window.usable
         self.far = np.zeros_like(self.area)
         self.variance_dn2, self.scale_dn = 1.0, np.inf
         self.weighted: Array | None = None
-        self.reason = NO_REASON
+
+    @property
+    def reason(self) -> Reason:
+        return self.reasons[0]
+
+    @reason.setter
+    def reason(self, reason: Reason) -> None:
+        self.reasons[0] = reason
 
     @property
     def state(self) -> FitState:
@@ -240,9 +270,9 @@ class PictureFit:
             own = self.informative & (shown > _OWN * shown[self.area].max(initial=0.0))
             misfit_dn = robust_scale(model.residuals[own]) if own.sum() >= _LEAST_AREA_PX else 0.0
             self.scale_dn = max(noise_dn, misfit_dn, _SCALE_FLOOR * self.contrast_dn)
-        self.reason = gauss_newton(self, tolerance_px, _ITERATIONS, _HALVINGS).reason
+        gauss_newton(self, self.every, tolerance_px, _ITERATIONS, _HALVINGS)
 
-    def solve(self) -> Array | None:
+    def solve(self, fits: Indices) -> Array:
         """Solve the normal equations with Tukey's or the grain's weights. A blur at its limit is held fixed there."""
         model, weights = self.model, self.weighted
         if weights is None:
@@ -252,16 +282,17 @@ class PictureFit:
         right = inner_products(weights, model.residuals[None])[:, 0] - priors * model.departures
         free = np.ones(len(right), dtype=bool)
         step = solution(normal, right, free)
-        if step is not None and model.blur_is_held(step):
+        if model.blur_is_held(step):
             free[model.blur] = False
             step = solution(normal, right, free)
-        return step
+        return step[None]
 
-    def step(self, step: Array) -> float:
-        """Apply a step and linearise there."""
-        moved_px = self.model.step(step)
+    def step(self, fits: Indices, steps: Array) -> Array:
+        """Apply a step and linearise there. Sets the reason if the state is not acceptable."""
+        moved_px = self.model.step(steps[0])
         self.model.linearise(self.used)
-        return moved_px
+        self.reason = self.failure()
+        return np.array([moved_px])
 
     def failure(self) -> Reason:
         """Reason why the state is not acceptable: too far from the start or too distorted."""
@@ -291,7 +322,8 @@ class PictureFit:
         start = before.pixel_from_mark[:, 2]
         self.weighted, smeared = gls_weights(model.design, self.used, noise, self.contrast_dn)
         self.variance_dn2, held = 1.0, self.variance_dn2
-        settled = gauss_newton(self, _CLOSE_PX, _WEIGHTED_STEPS).moved_px < _SETTLED_PX and not self.failure()
+        moved_px = float(gauss_newton(self, self.every, _CLOSE_PX, _WEIGHTED_STEPS)[0])
+        settled, self.reason = moved_px < _SETTLED_PX and not self.failure(), NO_REASON
         self.variance_dn2, moved = held, np.asarray(self.state.pixel_from_mark[:, 2] - start)
         if settled:
             by_grain = self._covariance(self.weighted, smeared)

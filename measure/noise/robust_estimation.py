@@ -42,13 +42,16 @@ def student_weights(squares: Array, dimensions: float) -> Array:
 
 def gauss_newton_step(design: NDArray[Real], residuals: NDArray[Real], weights: NDArray[Real], damping: float) -> Array:
     """(..., unknowns) Gauss-Newton step for derivatives (..., unknowns, observations), residuals and weights (...,
-    observations). damping: added to the diagonal of the normal equations scaled to unit diagonal (Levenberg)."""
+    observations); all nan where an unknown changes no observation. damping: added to the diagonal of the normal
+    equations scaled to unit diagonal (Levenberg)."""
     weighted = design * weights[..., None, :]
     normal = (weighted @ design.swapaxes(-1, -2)).astype(float)
     right = (weighted @ residuals[..., None]).astype(float)
-    size = np.sqrt(np.maximum(np.einsum("...uu->...u", normal), 1e-12))
+    squares = np.einsum("...uu->...u", normal)
+    size = np.sqrt(np.maximum(squares, 1e-12))
     scaled = normal / (size[..., :, None] * size[..., None, :]) + damping * np.eye(normal.shape[-1])
-    return np.asarray(np.linalg.solve(scaled, right / size[..., None])[..., 0] / size)
+    steps = np.linalg.solve(scaled, right / size[..., None])[..., 0] / size
+    return np.asarray(np.where((squares > 0).all(axis=-1, keepdims=True), steps, np.nan))
 
 
 def place_influences(design: NDArray[Real], weights: NDArray[Real]) -> Single:
@@ -59,16 +62,16 @@ def place_influences(design: NDArray[Real], weights: NDArray[Real]) -> Single:
     return np.asarray(inverse[:, :2].astype(np.float32) @ weighted, np.float32)
 
 
-def solution(normal: Array, right: Array, free: Mask) -> Array | None:
-    """Solve normal equations (unknowns, unknowns) for the free unknowns, 0 for the others; None if singular."""
-    squares = np.diag(normal)[free]
+def solution(normal: Array, right: Array, free: Mask) -> Array:
+    """Solve normal equations (unknowns, unknowns) for the free unknowns, 0 for the others; all nan if singular."""
+    squares, singular = np.diag(normal)[free], np.full(len(right), np.nan)
     if not np.all(squares > 0) or not np.all(np.isfinite(squares)):
-        return None
+        return singular
     size = np.sqrt(squares)
     scaled = normal[np.ix_(free, free)] / np.outer(size, size)
     values = np.linalg.eigvalsh(scaled)
     if not values[-1] < _WORST_CONDITION * values[0]:
-        return None
+        return singular
     result = np.zeros(len(right))
     result[free] = np.linalg.solve(scaled, right[free] / size) / size
     return result

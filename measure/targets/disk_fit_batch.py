@@ -5,13 +5,14 @@ four steps from there localise a disk to a tenth of a pixel, and the residuals t
 takes the edge as straight within the blur, which changes the size by a few hundredths of a pixel and not the centre.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.special import ndtr
 
 from measure.array_types import Array, Indices, Mask, Single
-from measure.flags import NO_REASON, Code, Reason
+from measure.flags import Code, Reason
+from measure.matching.gauss_newton import FitModel, gauss_newton
 from measure.matching.models import PIXEL_VARIANCE_PX2
 from measure.noise.noise_model import influence_covariances
 from measure.noise.robust_estimation import SIGMA_OF_DEVIATION, gauss_newton_step, place_influences, tukey_weights
@@ -20,10 +21,9 @@ from measure.targets.block_search import Patches, ScanBlock, concatenate
 
 _GROUP_PIXELS = 1 << 16  # pixels of the windows that are fitted together: 10 MiB with their derivatives
 _FIRST_BLUR_PX, _BLUR_PX = 1.0, (0.5, 8.0)  # initial value and limits, standard deviations, pixel width included
-_FIRST_STEPS_ROBUST = False, False, True  # steps on a subset of pixels; one robust step on all of them follows
 _HOPELESS = 1.5  # times the allowed misfit: patches above it are dropped before the first step
 _LONGEST_STEP = 0.3  # in radii: the limit of linearisation
-_PLAIN_STEPS, _MOST_STEPS, _SETTLED_PX = 2, 30, 1e-3  # of a fit to convergence
+_PLAIN_STEPS, _MOST_STEPS, _SETTLED_PX = 2, 30, 1e-3  # first ones, and all of a fit to convergence
 _UNDAMAGED = 0.05  # robust weight below which a pixel shows something else
 _DAMPING = 1e-4  # the unknowns of a faint disk are nearly dependent
 _UNKNOWNS = 10  # place (2), size, stretch, shear, blur, gain, offset, slopes (2)
@@ -43,9 +43,9 @@ def fit_disks(block: ScanBlock, patches: Patches) -> Patches:
     first = np.full(len(radius), _FIRST_BLUR_PX)
     of_edge = np.sqrt(8 * np.pi * radius / _EDGE_SAMPLES)
     strides = np.maximum(np.minimum(radius / _COARSE_PX, of_edge), 1.0).astype(np.intp)
-    promising, blurs = _fit_patches(block, patches, first, strides, _FIRST_STEPS_ROBUST, (_HOPELESS, _HOPELESS))
+    promising, blurs = _fit_patches(block, patches, first, strides, _PLAIN_STEPS, (_HOPELESS, _HOPELESS))
     whole = np.ones(len(blurs), np.intp)
-    return _fit_patches(block, promising, blurs, whole, (True,), (np.inf, 1.0))[0].strongest_first()
+    return _fit_patches(block, promising, blurs, whole, 0, (np.inf, 1.0))[0].strongest_first()
 
 
 def _fit_patches(
@@ -53,11 +53,12 @@ def _fit_patches(
     patches: Patches,
     blurs: Array,
     strides: Indices,
-    steps_robust: Sequence[bool],
+    plain_steps: int,
     most_misfits: tuple[float, float],
 ) -> tuple[Patches, Array]:
-    """Fitted disks among the patches and their blurs (n,). strides (n,): spacing of the sampled columns and rows, since
-    large disks need only part of their pixels; most_misfits: allowed before and after the steps."""
+    """Fitted disks among the patches and their blurs (n,), by some plain steps and a robust one. strides (n,): spacing
+    of the sampled columns and rows, since large disks need only part of their pixels; most_misfits: allowed before and
+    after the steps."""
     found, blurs_found = [Patches.collect(())], [np.zeros(0)]
     margins_px = np.maximum(MARGIN * patches.radii, LEAST_MARGIN_PX)
     for group in _groups(patches, strides, margins_px):
@@ -68,8 +69,8 @@ def _fit_patches(
             if not len(own):
                 continue
             fit = _DiskFit(block, patches.part(own), blurs[own], strides[own], margins_px[own])
-        for is_robust in steps_robust:
-            fit.step(is_robust)
+        fit.plain_steps = plain_steps
+        gauss_newton(fit, fit.every, 0.0, plain_steps + 1)
         is_disk = fit.is_disk(patches.part(own), most_misfits[1])
         found.append(fit.patches().part(is_disk))
         blurs_found.append(fit.blur[is_disk])
@@ -83,13 +84,9 @@ def place_disks(block: ScanBlock, patches: Patches, margins_px: Array) -> list[M
     for group in _groups(patches, strides, margins_px):
         own = patches.part(group)
         fit = _DiskFit(block, own, blurs[group], strides[group], margins_px[group], is_censored=True)
-        for step in range(_MOST_STEPS):
-            before = fit.centers
-            fit.step(is_robust=step >= _PLAIN_STEPS)
-            is_settled = np.linalg.norm(fit.centers - before, axis=1) < _SETTLED_PX
-            if step > _PLAIN_STEPS and is_settled.all():
-                break
-        placed |= zip(group.tolist(), fit.placed(is_settled & fit.is_disk(own, 1.0)), strict=True)
+        gauss_newton(fit, fit.every, _SETTLED_PX, _MOST_STEPS)
+        fit.refuse(np.flatnonzero(~fit.is_disk(own, 1.0)), _NO_DISK)
+        placed |= zip(group.tolist(), fit.placed(), strict=True)
     return [placed[number] for number in range(len(blurs))]
 
 
@@ -110,11 +107,14 @@ def _half_sides(patches: Patches, strides: Indices, margins_px: Array) -> Indice
     return np.asarray(np.ceil((longest + margins_px + 0.5) / strides), np.intp)
 
 
-class _DiskFit:
+class _DiskFit(FitModel):
     """State of the fit of n disks. centers (n, 2) relative to the window centres, px; shapes (n, 2, 2); blur (n,), px;
     greys (n, 4): gain, offset, slopes. Windows of side * side pixels: col, row (n, pixels) relative to their centres,
-    grey (n, pixels), used (n, pixels): inside the ellipse and its margin. is_censored: whether grey values at the ends
-    of the range may stand for any beyond."""
+    grey (n, pixels), used (n, pixels): inside the ellipse and its margin, informative (n, pixels): and not clipped;
+    scale (n,): robust one of the residuals; plain_steps: left before robust ones. is_censored: whether grey values at
+    the ends of the range may stand for any beyond."""
+
+    damping = _DAMPING
 
     def __init__(
         self,
@@ -125,6 +125,7 @@ class _DiskFit:
         margins_px: Array,
         is_censored: bool = False,
     ) -> None:
+        super().__init__(len(blurs))
         half, stride = int(_half_sides(patches, strides, margins_px).max()), strides[:, None]
         middles = np.rint(patches.centers).astype(np.intp)
         corners, self.side = middles - half * stride, 2 * half + 1
@@ -132,54 +133,62 @@ class _DiskFit:
         col, row = np.tile(along, self.side), np.repeat(along, self.side, axis=1)
         inside = block.holds(corners[..., None] + along[:, None])
         self.grey = block.grey_values(corners, col, row)
-        self.ends = block.clipped_ends(corners, col, row) if is_censored else np.int8(0)
+        self.ends = block.clipped_ends(corners, col, row) if is_censored else np.zeros((len(blurs), 1), np.int8)
         self.col, self.row = (np.asarray(one - half * stride, np.float32) for one in (col, row))
         self.middles, self.radius = middles, patches.radii
-        self.centers, self.shapes = patches.centers - middles, patches.shapes
-        self.blur = blurs
-        edges = _Edges(self)
+        self.centers, self.shapes, self.blur = patches.centers - middles, patches.shapes.copy(), blurs.copy()
+        edges = _Edges(self, self.every)
         near = edges.distance >= -margins_px[:, None]
         self.used = near & (inside[:, 0, None] & inside[:, 1, :, None]).reshape(near.shape)
-        design = edges.design(self)
-        self.greys = gauss_newton_step(design[:, 6:], self.grey, self.used.astype(np.float32), _DAMPING)
-        self.linearise(design)
+        self.design = edges.design(self)
+        greys = gauss_newton_step(self.design[:, 6:], self.grey, self.used.astype(np.float32), _DAMPING)
+        self.greys = np.nan_to_num(greys)  # without pixels
+        self.residuals, self.informative = np.empty_like(self.grey), np.empty_like(self.used)
+        self.scale, self.plain_steps = np.empty(len(blurs)), _PLAIN_STEPS
+        self.linearise(self.every, self.design)
 
-    def linearise(self, design: Single) -> None:
-        """Set the design matrix (n, unknowns, pixels), the residuals (n, pixels) and their robust scale (n,)."""
-        self.design = design
-        self.residuals = self.grey - (self.greys[:, None].astype(np.float32) @ self.design[:, 6:])[:, 0]
-        self.design[:, :6] *= self.greys[:, :1, None].astype(np.float32)
+    def linearise(self, fits: Indices, design: Single) -> None:
+        """Set the design matrix of m fits from that by unit gain, their residuals, and the robust scale of these."""
+        greys, used = self.greys[fits].astype(np.float32), self.used[fits]
+        residuals = self.grey[fits] - (greys[:, None] @ design[:, 6:])[:, 0]
+        design[:, :6] *= greys[:, :1, None]
         # A clipped grey value says nothing where the model lies beyond the end of the range as well.
-        self.informative = self.used & (self.ends * self.residuals >= 0)
-        middle, count = self.informative.shape[1] // 2, self.informative.sum(axis=1)
+        informative = used & (self.ends[fits] * residuals >= 0)
+        middle, count = informative.shape[1] // 2, informative.sum(axis=1)
         # Other pixels are put below and above all of these in equal numbers, so that the median stays the median.
-        beyond = np.where(np.cumsum(~self.informative, axis=1) % 2, np.float32(np.inf), np.float32(-1))
-        off = np.where(self.informative, np.abs(self.residuals), beyond)
+        beyond = np.where(np.cumsum(~informative, axis=1) % 2, np.float32(np.inf), np.float32(-1))
+        off = np.where(informative, np.abs(residuals), beyond)
         off.partition(middle, axis=1)
         unbiased = np.sqrt(count / np.maximum(count - _UNKNOWNS, 1))
-        self.scale = np.asarray(SIGMA_OF_DEVIATION * np.where(count > 0, off[:, middle], np.inf) * unbiased, float)
+        self.scale[fits] = SIGMA_OF_DEVIATION * np.where(count > 0, off[:, middle], np.inf) * unbiased
+        self.design[fits], self.residuals[fits], self.informative[fits] = design, residuals, informative
 
-    def step(self, is_robust: bool) -> None:
-        """Take one Gauss-Newton step; a robust one down-weights dust and neighbours."""
-        weights = self._weights() if is_robust else self.informative.astype(np.float32)
-        change = gauss_newton_step(self.design, self.residuals, weights, _DAMPING)
-        form = change[:, :5] / np.maximum(np.abs(change[:, :5]).max(axis=1, keepdims=True) / _LONGEST_STEP, 1.0)
-        self.centers = self.centers + (self.shapes @ form[:, :2, None])[..., 0]
+    def step(self, fits: Indices, steps: Array) -> Array:
+        """Apply steps, shortened to the range of the linearisation. Returns (m,) movements of the centres in px."""
+        form = steps[:, :5] / np.maximum(np.abs(steps[:, :5]).max(axis=1, keepdims=True) / _LONGEST_STEP, 1.0)
+        moves = (self.shapes[fits] @ form[:, :2, None])[..., 0]
         size, stretch, shear = form[:, 2:].T
         forms = np.array([[1 + size + stretch, shear], [shear, 1 + size - stretch]]).transpose(2, 0, 1)
-        self.shapes = self.shapes @ forms
-        self.blur = np.clip(self.blur + np.clip(change[:, 5], -0.5 * self.blur, self.blur), *_BLUR_PX)
-        self.greys = self.greys + change[:, 6:]
-        self.linearise(_Edges(self).design(self))
+        self.centers[fits] += moves
+        self.shapes[fits] = self.shapes[fits] @ forms
+        blur = self.blur[fits]
+        self.blur[fits] = np.clip(blur + np.clip(steps[:, 5], -0.5 * blur, blur), *_BLUR_PX)
+        self.greys[fits] += steps[:, 6:]
+        self.linearise(fits, _Edges(self, fits).design(self))
+        self.plain_steps -= 1
+        return np.where(self.plain_steps < 0, np.linalg.norm(moves, axis=1), np.inf)
 
-    def _weights(self) -> Single:
-        """(n, pixels), Tukey's."""
-        scale = np.maximum(self.scale, _SCALE_FLOOR * np.abs(self.greys[:, 0]) + 1e-6)
-        return np.asarray(self.informative * tukey_weights(self.residuals / scale[:, None].astype(np.float32), 1.0))
+    def weights_of(self, fits: Indices) -> Single:
+        """(m, pixels), Tukey's against dust and neighbours after plain steps."""
+        informative: Mask = np.asarray(self.informative[fits])
+        if self.plain_steps > 0:
+            return informative.astype(np.float32)
+        scale = np.maximum(self.scale[fits], _SCALE_FLOOR * np.abs(self.greys[fits, 0]) + 1e-6)
+        return np.asarray(informative * tukey_weights(self.residuals[fits] / scale[:, None].astype(np.float32), 1.0))
 
-    def placed(self, is_disk: Mask) -> Iterator[MarkFit]:
+    def placed(self) -> Iterator[MarkFit]:
         """The disks in scan pixels, with covariances."""
-        weights, found = self._weights(), self.patches()
+        weights, found = self.weights_of(self.every), self.patches()
         counted = weights > _UNDAMAGED
         influence = self.shapes.astype(np.float32) @ place_influences(self.design, weights)
         size = len(weights), -1, self.side, self.side
@@ -190,8 +199,8 @@ class _DiskFit:
         damaged = 1 - weights.sum(axis=1) / np.maximum(self.informative.sum(axis=1), 1)
         for number, (center_px, shape) in enumerate(zip(found.centers, found.shapes, strict=True)):
             yield MarkFit(
-                converged=bool(is_disk[number]),
-                reason=NO_REASON if is_disk[number] else _NO_DISK,
+                converged=not self.reasons[number],
+                reason=self.reasons[number],
                 center_px=center_px,
                 place_covariance=Covariance.from_noise(covariances[number]),
                 pixel_from_mark=np.column_stack([shape, center_px]),
@@ -227,10 +236,10 @@ class _Edges:
     """Position of pixels (n, pixels) relative to their ellipse. radius: normalised, 1 on the ellipse; col, row:
     direction in the unit disk; px: length of a radius across the edge; distance: to the edge, px, positive inside."""
 
-    def __init__(self, fit: _DiskFit) -> None:
-        inverse = np.linalg.inv(fit.shapes).astype(np.float32)
-        center = fit.centers.astype(np.float32)
-        unit = inverse @ np.stack([fit.col - center[:, :1], fit.row - center[:, 1:]], axis=1)
+    def __init__(self, fit: _DiskFit, fits: Indices) -> None:
+        inverse, self.fits = np.linalg.inv(fit.shapes[fits]).astype(np.float32), fits
+        center = fit.centers[fits].astype(np.float32)
+        unit = inverse @ np.stack([fit.col[fits] - center[:, :1], fit.row[fits] - center[:, 1:]], axis=1)
         self.radius: Single = np.maximum(np.sqrt(unit[:, 0] ** 2 + unit[:, 1] ** 2), np.float32(1e-6))
         direction = unit / self.radius[:, None]
         self.col, self.row = direction[:, 0], direction[:, 1]
@@ -241,12 +250,13 @@ class _Edges:
     def design(self, fit: _DiskFit) -> Single:
         """(n, unknowns, pixels) derivatives with respect to centre, size, stretch and shear (in units of the ellipse)
         and blur (px), all divided by the gain; then with respect to gain, offset and slopes."""
-        blur, size = (one[:, None].astype(np.float32) for one in (fit.blur, fit.radius))
+        blur, size = (one[self.fits, None].astype(np.float32) for one in (fit.blur, fit.radius))
         place = self.distance / blur
         density = np.exp(-place * place / 2) / (np.float32(np.sqrt(2 * np.pi)) * blur)
         moved = density * self.px
         grown = moved * self.radius
         ellipse = [moved * self.col, moved * self.row, grown, grown * (self.col**2 - self.row**2)]
         ellipse.append(2 * grown * self.col * self.row)
-        greys = [-density * place, ndtr(place), np.ones_like(place), fit.col / size, fit.row / size]
+        greys = [-density * place, ndtr(place), np.ones_like(place), fit.col[self.fits] / size]
+        greys.append(fit.row[self.fits] / size)
         return np.stack([*ellipse, *greys], axis=1).astype(np.float32, copy=False)

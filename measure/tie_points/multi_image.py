@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.special import chdtrc
 
-from measure.array_types import Array, Mask
+from measure.array_types import Array, Indices, Mask
 from measure.flags import NO_REASON, Code, Reason
-from measure.matching.gauss_newton import UNSETTLED, gauss_newton
+from measure.matching.gauss_newton import FitModel, gauss_newton
 from measure.noise.noise_model import NoiseModel, correlate, noise_model
 
 # Covariance, up to scale, of the coefficients of u², uv and v² of a surface with isotropic curvature.
@@ -148,13 +148,13 @@ def _area(matched: Sequence[Matched]) -> float:
     return float(np.mean([np.trace(each.covariance_px2) for each in matched]))
 
 
-class _JointMatch:
+class _JointMatch(FitModel):
     """State of the joint matching: the geometry of every piece."""
 
     def __init__(self, pieces: Sequence[Piece], reference: int, radius_px: int) -> None:
+        super().__init__(len(pieces))
         self.pieces, self.reference = pieces, reference
         self.maps = [np.array(piece.scan_from_patch, dtype=float) for piece in pieces]
-        self.reasons = [NO_REASON] * len(pieces)
         edge = np.arange(-radius_px - 1, radius_px + 2)
         self.grid = np.stack(np.meshgrid(edge, edge), axis=-1).astype(float)
         self.used: Mask = np.hypot(self.grid[..., 0], self.grid[..., 1]) <= radius_px
@@ -172,33 +172,28 @@ class _JointMatch:
             if smoothing_px > 0.0:
                 picture = cv2.GaussianBlur(picture, (0, 0), smoothing_px)
             self.splines.append(np.asarray(ndimage.spline_filter(picture, order=3, mode="mirror")))
-        if gauss_newton(self, _STILL_PX, _ITERATIONS).reason == UNSETTLED:
-            self.reasons = [Reason("the matching does not come to rest", Code.NO_FIT)] * len(self.pieces)
+        gauss_newton(self, self.every, _STILL_PX, _ITERATIONS)
 
-    def solve(self) -> Array | None:
-        """(frames, 6) affine corrections that align each piece with the reference; None where it fails, with
-        reasons."""
+    def solve(self, _: Indices) -> Array:
+        """(frames, 6) affine corrections that align each piece with the reference; 0 where one fails, with reasons."""
         self._resample()
         if any(self.reasons) or not self._linearise():
-            return None
+            return np.zeros((len(self.pieces), 6))
         differences = (self.values - self.values[self.reference])[:, self.used]
         return np.asarray(np.linalg.solve(self.normal, self.design[:, self.used] @ differences.T).T)
 
-    def step(self, step: Array) -> float:
-        """Apply affine corrections d(u) (frames, 6): patch coordinate u then maps to u - d(u). Returns the largest
-        shift, px."""
-        for index, own in enumerate(step):
+    def step(self, _: Indices, steps: Array) -> Array:
+        """Apply affine corrections d(u) (frames, 6): patch coordinate u then maps to u - d(u). All pieces share the
+        patch and go on together: returns their largest shift, px, for each."""
+        for index, own in enumerate(steps):
             if not np.isfinite(own).all() or np.hypot(*own[:2]) > _FARTHEST_STEP_PX or np.abs(own[2:]).max() > 0.5:
                 self.reasons[index] = Reason("the matching runs away from the approximate place", Code.NO_FIT)
                 continue
             linear, shift = np.eye(2) - own[2:].reshape(2, 2), -own[:2]
             before = self.maps[index]
             self.maps[index] = np.column_stack([before[:, :2] @ linear, before[:, :2] @ shift + before[:, 2]])
-        return float(np.abs(step[:, :2]).max())
-
-    def failure(self) -> Reason:
-        """Reason of the first piece that failed, if any."""
-        return next((reason for reason in self.reasons if reason), NO_REASON)
+        largest_px = 0.0 if any(self.reasons) else float(np.abs(steps[:, :2]).max())
+        return np.full(len(steps), largest_px)
 
     def _resample(self) -> None:
         """Resample all pieces onto the grid of the patch, centred and scaled to unit contrast."""

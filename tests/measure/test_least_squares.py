@@ -18,7 +18,7 @@ from measure.fiducials.options import FiducialOptions
 from measure.flags import NO_REASON, Cause, Code, Reason, Status
 from measure.marks.shapes import Mark, MarkShape, Polygon, cross, dot, polygon, ring_cross, ring_dot
 from measure.marks.templates import learn_template
-from measure.matching.gauss_newton import UNDETERMINED, UNSETTLED, gauss_newton
+from measure.matching.gauss_newton import UNDETERMINED, UNSETTLED, FitModel, gauss_newton
 from measure.noise.robust_estimation import least_distances, solution, student_weights, tukey_loss, tukey_weights
 from measure.results import Covariance, MarkMeasurement
 from measure.targets.detection import DiskSearch
@@ -30,34 +30,43 @@ from measure.tone.curve import sampled_curve
 FAR = Reason("too far", Code.NO_FIT)
 
 
-class Arctangent:
-    """atan(x) is to be 0: full steps from |x| > 1.39 grow for ever."""
+class Arctangent(FitModel):
+    """atan(x) is to be 0, for each of several x: full steps from |x| > 1.39 grow for ever."""
 
-    def __init__(self, start: float) -> None:
-        self.state = start
+    def __init__(self, *starts: float) -> None:
+        super().__init__(len(starts))
+        self.state = np.array(starts)
 
-    def solve(self) -> np.ndarray | None:
-        slope = 1 / (1 + self.state**2)
-        return np.array([-np.arctan(self.state) / slope, 0.0]) if slope > 1e-12 else None
+    def solve(self, fits: NDArray[np.intp]) -> Array:
+        slope = 1 / (1 + self.state[fits] ** 2)
+        steps = np.stack([-np.arctan(self.state[fits]) / slope, 0 * slope], axis=1)
+        return np.where(slope[:, None] > 1e-12, steps, np.nan)
 
-    def step(self, step: np.ndarray) -> float:
-        self.state += float(step[0])
-        return abs(float(step[0]))
-
-    def failure(self) -> Reason:
-        return FAR if abs(self.state) > 1e3 else NO_REASON
+    def step(self, fits: NDArray[np.intp], steps: Array) -> Array:
+        self.state = self.state.copy()
+        self.state[fits] += steps[:, 0]
+        for number in fits:
+            self.reasons[number] = FAR if abs(self.state[number]) > 1e3 else NO_REASON
+        return np.abs(steps[:, 0])
 
     def cost(self) -> float:
-        return float(np.arctan(self.state) ** 2)
+        return float(np.sum(np.arctan(self.state) ** 2))
 
 
-def test_steps_that_do_not_lessen_the_cost_are_halved_and_what_is_not_at_rest_says_so() -> None:
-    assert gauss_newton(Arctangent(3.0), 1e-6, 30).reason == FAR
+def test_steps_that_do_not_lessen_the_cost_are_halved() -> None:
     model = Arctangent(3.0)
-    assert not gauss_newton(model, 1e-6, 30, 4).reason
+    gauss_newton(model, model.every, 1e-6, 30, 4)
+    assert not model.reasons[0]
     assert model.state == pytest.approx(0.0, abs=1e-12)
-    assert gauss_newton(Arctangent(1e7), 1e-6, 10).reason == UNDETERMINED
-    assert gauss_newton(Arctangent(1.0), 1e-6, 2).reason == UNSETTLED
+
+
+def test_each_fit_of_a_batch_ends_for_itself_and_says_why() -> None:
+    model, alone = Arctangent(3.0, 1.2, 0.5, 1e7, 0.9), Arctangent(0.5)
+    moved = gauss_newton(model, np.arange(4), 1e-6, 5)
+    assert model.reasons == [FAR, UNSETTLED, NO_REASON, UNDETERMINED, NO_REASON]
+    np.testing.assert_array_equal(moved < 1e-6, [False, False, True, False])
+    gauss_newton(alone, alone.every, 1e-6, 30)
+    np.testing.assert_array_equal(model.state[[2, 4]], [alone.state[0], 0.9])
 
 
 def test_tukeys_weights_are_the_published_ones_and_his_loss_has_them_as_slope() -> None:
@@ -82,14 +91,11 @@ def test_normal_equations_are_solved_for_what_is_free_and_refused_where_they_tel
     truth, free = np.array([1.0, 2e-5, 3e5]), np.array([True, False, True])
     normal = design.T @ design
     found, held = solution(normal, normal @ truth, free | True), solution(normal, normal[:, free] @ truth[free], free)
-    assert found is not None
     np.testing.assert_allclose(found, truth)
-    assert held is not None
     np.testing.assert_allclose(held, [1.0, 0.0, 3e5])
     twice = design[:, [0, 0, 2]]
-    assert solution(twice.T @ twice, truth, np.ones(3, bool)) is None
-    assert solution(np.diag([1.0, 0.0, 1.0]), truth, np.ones(3, bool)) is None
-    assert solution(np.diag([1.0, -1e-18, 1.0]), truth, np.ones(3, bool)) is None  # as rounding leaves it
+    for singular in (twice.T @ twice, np.diag([1.0, 0.0, 1.0]), np.diag([1.0, -1e-18, 1.0])):  # as rounding leaves it
+        assert np.isnan(solution(singular, truth, np.ones(3, bool))).all()
 
 
 def test_least_distances_leave_false_places_aside() -> None:
