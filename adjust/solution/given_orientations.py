@@ -4,7 +4,7 @@ Exchanged names, wrong signs, units or columns of all rows; wrong values of a fe
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -100,14 +100,41 @@ def is_near(stations: Array, given: Array, depths: Array) -> Mask:
     return np.asarray(np.linalg.norm(stations - given, axis=1) < NEAR * depths)
 
 
+@dataclass(frozen=True)
+class _Compared:
+    """Adjusted orientations of images, and those given.
+
+    Attributes
+    ----------
+    names : of the images.
+    stations, places : (n, 3) adjusted and given stations.
+    depths : (n,) distances of the adjusted stations from the centre of the points.
+    rotations : (n, 3, 3), adjusted.
+    angles : (n, 3) rad, given.
+    """
+
+    names: list[str]
+    stations: Array
+    places: Array
+    depths: Array
+    rotations: Array
+    angles: Array
+
+    @staticmethod
+    def from_result(network: Network, result: Adjustment, given: Mapping[str, Array]) -> "_Compared":
+        stations, depths, places = adjusted_stations(result, given)
+        rotations = np.array([adjusted_image(result, name).rotation for name in given])
+        exterior = {image.name: image.exterior for image in network.images if image.exterior is not None}
+        angles = np.array([exterior[name].values[3:] for name in given])
+        return _Compared(list(given), stations, places, depths, rotations, angles)
+
+
 def orientations_elsewhere(network: Network, result: Adjustment, is_observed: bool = False) -> str:
     """Explain orientations that are not as they are given by mistakes of their table; empty where none does.
 
     Possible causes: exchanged names, wrong signs, units or columns of stations or angles, or mirrored points of a flat
     field. is_observed: whether standard deviations tell that the orientations contradict the images.
     """
-    given = {image.name: image.exterior for image in network.images if image.exterior is not None}
-    stations_given = given_stations(network)
     if result.termination == "singular" or not network.observed_points:
         return ""
     plan = {
@@ -117,19 +144,28 @@ def orientations_elsewhere(network: Network, result: Adjustment, is_observed: bo
     }
     if plan and (words := _other_unit(network, adjusted_places(result, list(plan))[:, :2], np.array([*plan.values()]))):
         return words.replace("stations or distances", "approximate X and Y")
-    if len(stations_given) < 2:
+    given = given_stations(network)
+    if len(given) < 2:
         return ""
-    names, (stations, depths, places) = list(stations_given), adjusted_stations(result, stations_given)
-    rotations = np.array([adjusted_image(result, name).rotation for name in names])
-    angles = np.array([given[name].values[3:] for name in names])
-    if words := _other_unit(network, stations, places):
-        return words
+    compared = _Compared.from_result(network, result, given)
+    return (
+        _other_unit(network, compared.stations, compared.places)
+        or _other_table(compared, is_observed)
+        or _mirrored_points(compared, _points(result))
+    )
+
+
+def _other_table(compared: _Compared, is_observed: bool) -> str:
+    """Describe exchanged names, or another reading of all rows; empty where neither explains the orientations."""
+    stations, places, depths, angles = compared.stations, compared.places, compared.depths, compared.angles
     off = np.flatnonzero(~is_near(stations, places, depths))
-    found = list[str]()
-    turned, is_turned = _best_reading(ANGLES, angles, lambda values: _rotation_errors(values, rotations), is_observed)
+    turned, is_turned = _best_reading(
+        ANGLES, angles, lambda values: _rotation_errors(values, compared.rotations), is_observed
+    )
     moved, is_moved = _best_reading(
         STATIONS, places, lambda values: np.linalg.norm(values - stations, axis=1) / depths, is_observed
     )
+    found = list[str]()
     nearest = np.linalg.norm(stations[off, None] - places[off], axis=2).argmin(axis=1) if len(off) else off
     if (
         len(off) > 1
@@ -137,29 +173,31 @@ def orientations_elsewhere(network: Network, result: Adjustment, is_observed: bo
         and is_near(stations[off], places[off[nearest]], depths[off]).all()
     ):
         # Exchanged names exchange attitudes too.
-        exchanged = _rotation_errors(angles[off[nearest]], rotations[off])
-        is_kept = CLEARLY * np.linalg.norm(_rotation_errors(angles[off], rotations[off])) < np.linalg.norm(exchanged)
-        if not (moved and is_kept):
-            found.append(
-                f"The frames {shortened([names[i] for i in off], NAMED)} each lie where another's orientation is given:"
-                " their names are exchanged, in the scans or in images.csv."
+        rotations = compared.rotations[off]
+        exchanged, kept = (np.linalg.norm(_rotation_errors(angles[rows], rotations)) for rows in (off[nearest], off))
+        if not moved or CLEARLY * kept >= exchanged:
+            sentence = (
+                f"The frames {shortened([compared.names[i] for i in off], NAMED)} each lie where another's orientation "
+                "is given: their names are exchanged, in the scans or in images.csv."
             )
-            is_own = CLEARLY * np.linalg.norm(exchanged) < np.linalg.norm(_rotation_errors(angles[off], rotations[off]))
-            if is_own or not moved:
-                return found[0]
-            found[0] = f"{found[0][:-1]}; or:"
-    if (is_turned and turned) or (is_moved and moved):
-        words = "; ".join(each for each in (moved, turned) if each)
-        return " ".join(
-            [
-                *found,
-                f"The orientations of all {len(names)} images are not those that the points give, but would be with "
-                f"another reading: {words}. Correct images.csv, or the points.",
-            ]
-        )
-    if 2 * len(off) <= len(names):
+            if CLEARLY * exchanged < kept or not moved:
+                return sentence
+            found = [f"{sentence[:-1]}; or:"]
+    if not ((is_turned and turned) or (is_moved and moved)):
         return ""
-    points = _points(result)
+    words = "; ".join(each for each in (moved, turned) if each)
+    found.append(
+        f"The orientations of all {len(angles)} images are not those that the points give, but would be with another "
+        f"reading: {words}. Correct images.csv, or the points."
+    )
+    return " ".join(found)
+
+
+def _mirrored_points(compared: _Compared, points: Array) -> str:
+    """Describe what mirrors the points of a flat field, whose stations then lie on its other side; empty if nothing."""
+    stations, places, depths = compared.stations, compared.places, compared.depths
+    if 2 * (~is_near(stations, places, depths)).sum() <= len(stations):
+        return ""
     middle = points.mean(axis=0)
     _, extents, axes = np.linalg.svd(points - middle, full_matrices=False)
     if extents[-1] > FLAT * extents[0]:
@@ -168,8 +206,9 @@ def orientations_elsewhere(network: Network, result: Adjustment, is_observed: bo
     for words, by in AXES.items():
         if is_near(reflected @ by.T, places, depths).all():
             return (
-                f"By the points the stations lie nowhere near where they are given, but all {len(names)} would with "
-                f"another reading of the points: {words}. Correct the points, or the stations."
+                "By the points the stations lie nowhere near where they are given, but all "
+                f"{len(stations)} would with another reading of the points: {words}. Correct the points, or the "
+                "stations."
             )
     return ""
 
@@ -186,23 +225,22 @@ def _other_unit(network: Network, found: Array, given: Array) -> str:
 
 def unlike_approximations(network: Network, result: Adjustment) -> str:
     """Note images whose given approximations are far from their adjusted orientations; empty where none is."""
-    given = {image.name: image.exterior for image in network.images if image.exterior and not image.is_observed}
-    stations = {name: each for name, each in given_stations(network).items() if name in given}
+    approximate = {image.name for image in network.images if not image.is_observed}
+    stations = {name: each for name, each in given_stations(network).items() if name in approximate}
     if not result.converged or not stations or not network.observed_points:
         return ""
-    found, depths, places = adjusted_stations(result, stations)
-    rotations = np.array([adjusted_image(result, name).rotation for name in stations])
-    angles = np.array([given[name].values[3:] for name in stations])
-    far = ~is_near(found, places, depths), _rotation_errors(angles, rotations) > NEAR
+    both = _Compared.from_result(network, result, stations)
+    is_far = ~is_near(both.stations, both.places, both.depths)
+    is_turned = _rotation_errors(both.angles, both.rotations) > NEAR
     rows = list[str]()
-    for k in np.flatnonzero(far[0] | far[1]).tolist():
+    for k in np.flatnonzero(is_far | is_turned).tolist():
         parts = []
-        if far[0][k]:
-            parts.append(f"the station ({_numbers(places[k])}) is found at ({_numbers(found[k])})")
-        if far[1][k]:
-            own = np.degrees(angles_from_rotation(rotations[k : k + 1])[0])
-            parts.append(f"omega, phi, kappa ({_numbers(np.degrees(angles[k]))}) as ({_numbers(own)}) degrees")
-        rows.append(f"{list(stations)[k]}: {', '.join(parts)}")
+        if is_far[k]:
+            parts.append(f"the station ({_numbers(both.places[k])}) is found at ({_numbers(both.stations[k])})")
+        if is_turned[k]:
+            own = np.degrees(angles_from_rotation(both.rotations[k : k + 1])[0])
+            parts.append(f"omega, phi, kappa ({_numbers(np.degrees(both.angles[k]))}) as ({_numbers(own)}) degrees")
+        rows.append(f"{both.names[k]}: {', '.join(parts)}")
     if not rows:
         return ""
     return (
