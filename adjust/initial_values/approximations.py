@@ -247,26 +247,34 @@ def _known_fields(camera: Camera, frames: Frames, principal_point_mm: Array) -> 
 
 def _sights(camera: Camera, frames: Frames, interior: Array) -> dict[str, Sight]:
     """Correct the image coordinates of a camera for its prior distortion."""
-    # Raises AdjustmentError where this distortion is not invertible within an image (it folds the image over).
+    # Raises AdjustmentError where this distortion is not invertible within an image (it folds the image over), and
+    # UnorientedError with the images that show what lies too far off the axis of a fisheye.
     known = camera.distortion.parameters
     lens = Lens(camera.distortion, interior, camera.distortion.values)
     images = frames.camera_images(camera.name)
     folds = lens.folded_over(frames.xy_mm[frames.places(images)])
-    first = np.cumsum([0, *np.diff(frames.starts)[images]])
+    first, too_wide = np.cumsum([0, *np.diff(frames.starts)[images]]), dict[str, str]()
     for i, start, stop in zip(images, first[:-1], first[1:], strict=True) if folds.any() else ():
         folded = folds[start:stop]
         if folded.mean() > MOST_FOLDED:
             radius_mm = float(np.linalg.norm(frames.xy_mm[frames.part(i)][folded] - interior[1:], axis=1).min())
             given = [name for name in lens.quantities if name in known and known[name].value]
             values = ", ".join(f"{name} = {known[name].value:g}" for name in given)
-            is_wide = camera.distortion.family == "opencv_fisheye"
-            wide = " What lies 90 degrees and more off the axis has no image here: leave it out." if is_wide else ""
+            if camera.distortion.family == "opencv_fisheye" and not given:
+                name = frames.network.images[i].name
+                too_wide[name] = (
+                    f"image {name} shows {folded.sum()} of its {len(folded)} points 90 degrees and more off the axis, "
+                    "where the model of a fisheye has no image. Leave these points out."
+                )
+                continue
             raise AdjustmentError(
                 f"camera {camera.name}: the distortion that is given ({values or 'all 0'}) folds the image over: from "
                 f"{radius_mm:.3g} mm off the principal point on, what lies farther out would appear farther in, and "
                 f"{folded.sum()} of the {len(folded)} points of an image were measured there. Correct the signs, the "
-                f"units or the family of these values, the principal point or c, or begin with 0.{wide}"
+                "units or the family of these values, the principal point or c, or begin with 0."
             )
+    if too_wide:
+        raise UnorientedError(too_wide)
     return frames.sights(camera.name, lens)
 
 

@@ -18,6 +18,7 @@ from adjust.display import CameraPlots, PlottedResult, data_frame
 from adjust.errors import AdjustmentError
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
+from adjust.validation import LARGEST_SIGMA
 from measure import MeasurementError, open_scan
 from measure.boards.find import recognise_board
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
@@ -248,10 +249,13 @@ def _chosen_lens(
     project: Project, first: Adjustment, camera: CameraPictures, options: project_files.CalibrationOptions
 ) -> LensChoice:
     """Select the lens model by cross-validation. All marks get one standard deviation, large enough for models with
-    larger misfit than the first."""
+    larger misfit than the first, but no larger than an adjustment accepts: the first may not suit the lens at all."""
     observations = first.network.observations
     variance = float(np.median(np.trace(observations.covariance_mm2, axis1=1, axis2=2)) / 2.0)
     variance += (GENEROUS**2 - 1.0) * first.unmodelled_mm[camera.name] ** 2
+    extents = first.network.extent_by_image
+    per_mm = float(np.median([1.0 / extents[image].half_mm for image in observations.image]))
+    variance = min(variance, (0.99 * LARGEST_SIGMA / per_mm) ** 2)
     covariance = np.broadcast_to(variance * np.eye(2), observations.covariance_mm2.shape).copy()
     alike = replace(first.network, observations=replace(observations, covariance_mm2=covariance))
     adjusted = partial(adjust, options=adjustment_options(project.adjust))

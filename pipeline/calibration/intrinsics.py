@@ -74,7 +74,7 @@ def choose_lens(
     """
     if len(network.images) < FEWEST_VALIDATED:
         return LensChoice("opencv4", {})
-    squares: dict[LensModel, Array | None] = {}
+    squares: dict[LensModel, dict[str, float]] = {}  # by image
     best: LensModel = "opencv4"
     (camera,), is_wide = network.cameras, False
     for model in PARAMETERS:
@@ -87,7 +87,9 @@ def choose_lens(
             fitted = None
         if fitted is not None and not fitted.converged:
             fitted = None
-        squares[model] = None if fitted is None else fitted.prediction_errors(FOLDS)
+        errors = None if fitted is None else fitted.prediction_errors(FOLDS)
+        names = [] if fitted is None or errors is None else [image.name for image in fitted.network.images]
+        squares[model] = dict(zip(names, () if errors is None else errors.tolist(), strict=True))
         start = start if fitted is None else fitted.start
         if model == "opencv4":
             c_mm = 0.0 if fitted is None else fitted.value(Parameter.interior(camera.name, "c"))
@@ -96,15 +98,17 @@ def choose_lens(
         best = rich if _is_better(squares[rich], squares[simple]) else simple
     sigma_px = np.sqrt(network.observations.covariance_mm2[0, 0, 0]) / pixel_mm
     rms_px = {
-        model: None if each is None else float(np.sqrt(each.mean()) * sigma_px) for model, each in squares.items()
+        model: float(np.sqrt(np.mean([*each.values()])) * sigma_px) if each else None for model, each in squares.items()
     }
     return LensChoice(best, rms_px)
 
 
-def _is_better(squares: Array | None, than: Array | None) -> bool:
-    if squares is None or than is None:
-        return squares is not None
-    gain = than - squares
+def _is_better(squares: Mapping[str, float], than: Mapping[str, float]) -> bool:
+    """Whether the images that both models predict are predicted better."""
+    common = [image for image in squares if image in than]
+    if len(common) < 2:
+        return len(squares) > len(than)
+    gain = np.array([than[image] - squares[image] for image in common])
     return bool(gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)))
 
 

@@ -41,6 +41,9 @@ _ROUNDED_UM = 1.0 / np.sqrt(12.0)  # standard deviation of values rounded to 1 �
 LARGEST_CONDITION = 1e7  # of the scaled columns: their normal equations have its square
 _CURVE = 400  # samples of the curve whose extremes are balanced
 NUMBERS = Key("list of numbers", numbers)
+REACH_MM = (10.0, 500.0)  # from the axis to the last value of a table, of any film camera
+SMALLEST_UM = 0.1  # largest distortion of a table; no camera has less
+MARKS_REACH = 4.0  # of a table and its fiducials: largest ratio
 
 
 @dataclass(frozen=True)
@@ -114,9 +117,10 @@ class Certificate:
                 key, f"has {len(places)} places for {count} values of radial_um: give one a value, two or more."
             )
         if min(places) <= 0.0 or len(set(places)) < count:
-            raise WrongKey(key, "must be positive and different.")
+            raise WrongKey(key, "must be positive and different: leave out the axis, and what is there twice.")
         if self.angle_deg and max(self.angle_deg) >= 90.0:
             raise WrongKey(key, "must lie below 90 degrees.")
+        self._check_units(key)
         has_two = self.autocollimation_mm is not None or self.symmetry_mm is not None
         if self.principal_point_mm is not None and has_two:
             raise WrongKey(
@@ -126,6 +130,24 @@ class Certificate:
             raise WrongKey(
                 "symmetry_mm", "needs autocollimation_mm. Give the only point that there is as principal_point_mm."
             )
+
+    def _check_units(self, key: str) -> None:
+        """Raise WrongKey where sizes fit no film camera, or the table not its fiducials; key: of the places."""
+        radius_mm, tangent, radial_mm = self.curve
+        reach_mm = float(np.max(radius_mm))
+        given = (
+            f"the table reaches from the axis to {reach_mm:.4g} mm ({np.degrees(np.arctan(tangent.max())):.3g} degrees)"
+        )
+        if not REACH_MM[0] < reach_mm < REACH_MM[1]:
+            raise WrongKey(key, f"or the principal distance has another unit: {given}. Give degrees and mm.")
+        marks_mm = max((math.hypot(*one.xy_mm) for one in self.fiducial), default=reach_mm)
+        if not reach_mm / MARKS_REACH < marks_mm < MARKS_REACH * reach_mm:
+            raise WrongKey(
+                key, f"or xy_mm of the fiducials has another unit: {given}, the fiducials to {marks_mm:.4g} mm."
+            )
+        if 0.0 < np.abs(radial_mm).max() < SMALLEST_UM / 1000.0:
+            largest_um = 1000.0 * np.abs(radial_mm).max()
+            raise WrongKey("radial_um", f"is {largest_um:.2g} µm at most. Give µm: 3.0, not 0.003.")
 
     @property
     def distance_mm(self) -> float:

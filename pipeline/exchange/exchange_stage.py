@@ -173,7 +173,8 @@ def _unknown_notes(cameras: Sequence[CameraFile]) -> Iterator[str]:
             "the camera file if it is to be adjusted."
         )
     for camera in cameras:
-        if camera.fiducials and camera.principal_point_mm is not None:
+        is_stated = np.isfinite(camera.principal_point_sigma_mm).all()  # as by a certificate
+        if camera.fiducials and camera.principal_point_mm is not None and not is_stated:
             x, y = camera.principal_point_mm
             yield (
                 f"{camera.name}: the files give no principal point. Adjusting starts at the middle of the fiducials, "

@@ -889,6 +889,25 @@ def board_network(
     return digital_network(camera, view_rows(views, list(xyz)), xyz, given_mm or sigma_mm)
 
 
+def equidistant_network(rng: np.random.Generator, steepest: float, distance_mm: float, count: int) -> Network:
+    """Board of 6 x 5 corners under a lens r = c θ, its middle `steepest` rad off the axis in every third picture; marks
+    with errors of 0.1 µm."""
+    grid = np.array([[20.0 * column, 20.0 * row, 0.0] for row in range(5) for column in range(6)])
+    views = []
+    for number in range(count):
+        polar, azimuth = steepest * (number % 3) / 2.0, 0.7 * number
+        rotation = np.asarray(cv2.Rodrigues(polar * np.array([-np.sin(azimuth), np.cos(azimuth), 0.0]))[0])
+        tilted = rotation @ cv2.Rodrigues(rng.uniform(-0.4, 0.4, 3))[0]
+        x, y, z = ((grid - grid.mean(axis=0)) @ tilted.T + rotation @ [0.0, 0.0, distance_mm]).T
+        radius = np.hypot(x, y)
+        views.append(np.stack([x, -y], axis=1) * (1.3 * np.arctan2(radius, z) / radius)[:, None])
+    places = np.array(views) + rng.normal(0.0, 1e-4, (count, len(grid), 2))
+    xyz = {f"b{number}": place for number, place in enumerate(grid * [1.0, -1.0, 1.0])}
+    distortion = Distortion("opencv_fisheye", {f"k{k}": Prior(0.0, np.inf) for k in range(1, 5)})
+    camera = Camera("wide", None, None, None, distortion, frame_mm=(4.8, 4.8))
+    return digital_network(camera, view_rows(places, list(xyz)), xyz, 1e-4)
+
+
 LENS_R0_MM = 13.0
 LENS_SIGMA_MM = 0.0004
 LENSES: dict[str, tuple[float, dict[str, float]]] = {  # principal distance in mm, parameters

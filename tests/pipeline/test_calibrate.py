@@ -17,7 +17,7 @@ import cv2
 import matplotlib as mpl
 import numpy as np
 import pytest
-from networks import board_network
+from networks import board_network, equidistant_network
 from numpy.typing import NDArray
 from PIL import Image
 from projects import Refusal, command, made_record, present
@@ -38,6 +38,7 @@ from pipeline.calibration.calibrate_stage import CalibrationResult
 from pipeline.calibration.intrinsics import LensChoice, LensModel, choose_lens
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures
 from pipeline.calibration.project_files import CalibrationOptions, board_options, check_folder, write_project
+from pipeline.files.project_file import AdjustSettings
 from pipeline.files.target_table import read_targets
 from pipeline.opencv_check.board_corners import BoardPictures, compare_corners, detector_name, find_points
 from pipeline.opencv_check.opencv_calibration import NAMES, Freedom, OpenCvCalibration, OpenCVPoints, calibrate
@@ -506,6 +507,25 @@ def test_a_fisheye_is_tried_where_the_field_is_wide(monkeypatch: pytest.MonkeyPa
         assert set(choice.rms_px) == tried
 
 
+def choose_wide_lens(network: Network, unmodelled_mm: float, monkeypatch: pytest.MonkeyPatch) -> LensChoice:
+    """Lens, opencv4 or fisheye, after a first adjustment with so large errors that are not modelled."""
+    monkeypatch.delitem(intrinsics.PARAMETERS, "opencv5")
+    monkeypatch.delitem(intrinsics.PARAMETERS, "opencv8")
+    first: Any = SimpleNamespace(network=network, unmodelled_mm={"wide": unmodelled_mm}, start=None)
+    project: Any = SimpleNamespace(adjust=AdjustSettings())
+    options: Any = SimpleNamespace(square_pixels=True, pixel_mm=PIXEL_MM)
+    camera: Any = SimpleNamespace(name="wide")
+    return calibrate_stage._chosen_lens(project, first, camera, options)
+
+
+def test_a_fisheye_is_taken_where_the_first_lens_does_not_suit_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Errors not modelled are so large that twice as much would be refused as of another unit."""
+    network = equidistant_network(np.random.default_rng(3), 1.1, 200.0, 9)
+    choice = choose_wide_lens(network, 0.006, monkeypatch)
+    assert choice.model == "fisheye"
+    assert choice.rms_px["fisheye"] == pytest.approx(np.sqrt(2.0) * 1e-4 / PIXEL_MM, rel=0.2)
+
+
 @pytest.mark.parametrize(
     ("errors", "wanted"),
     [
@@ -523,6 +543,8 @@ def test_of_lenses_as_good_the_simplest_is_taken(errors: dict[int | str, float],
         distortion = network.cameras[0].distortion
         count = len(distortion.parameters)
         squares = errors["fisheye" if "fisheye" in distortion.family else count] * scatter[count]
-        return SimpleNamespace(converged=True, start=None, value=lambda _: 1.0, prediction_errors=lambda _: squares)
+        return SimpleNamespace(
+            converged=True, network=network, start=None, value=lambda _: 1.0, prediction_errors=lambda _: squares
+        )
 
     assert choose_lens(network, True, PIXEL_MM, fake_adjust).model == wanted

@@ -163,7 +163,7 @@ ENTITIES = '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]><a>&c
         ("opencv", PIXELS.format("").replace("9, 5, 0", "-9, 5, 0"), "fx and fy positive"),
         ("opencv", PIXELS.format("").replace("9, 5, 0", "0, 5, 0"), "fx and fy positive"),
         ("colmap", "", "is no reconstruction"),
-        ("certificate", CERTIFICATE.replace("22.7", "89.99999"), "no curve can be fitted"),
+        ("certificate", CERTIFICATE.replace("7.5, 15.0", "1e-7, 2e-7"), "no curve can be fitted"),
         ("certificate", "radial_um = [1.0]", "calibrated principal distance"),
         ("certificate", f"{CERTIFICATE}symmetry_mm = [0.0, 0.01]", "needs autocollimation_mm"),
         ("certificate", f"{CERTIFICATE}principal_point_mm = [0, 0]\nsymmetry_mm = [0.0, 0.01]", "Give either"),
@@ -275,9 +275,33 @@ def test_what_a_calibration_does_not_say_is_no_knowledge(tmp_path: Path, capsys:
     camera, words = camera_and_words("certificate", table)
     assert camera.principal_point_mm == (0.01, 0.02)
     assert "no standard deviation of the principal point: 1 mm is assumed" in words
+    table.write_text(f'{table.read_text()}[[fiducial]]\nid = "1"\nxy_mm = [-106, 106]\nsigma_mm = 0.01\n')
+    camera, words = camera_and_words("certificate", table)
+    assert camera.principal_point_mm == (0.01, 0.02)
+    assert "the files give no principal point" not in words
     (tmp_path / "m.xml").write_text("<calibration><width>600</width><height>400</height><f>500</f></calibration>")
     _, words = camera_and_words("metashape", tmp_path / "m.xml", *PITCH)
     assert "no standard deviations. The calibration is held fixed" in words
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("= 153.0", "= 0.153", "reaches from the axis to 0.1284 mm"),
+        ("= 153.0", "= 15.3", "to 12.84 mm (40 degrees), the fiducials to 149.9 mm"),
+        (str(ANGLES), "[0.13, 0.26, 0.40, 0.52, 0.61, 0.70]", "Give degrees and mm"),
+        (str(TABLE), "[0.003, 0.004, 0.001, -0.003, -0.004, 0.003]", "is 0.004 µm at most. Give µm"),
+        ("-106", "-106000", "the fiducials to 1.06e+05 mm"),
+    ],
+)
+def test_another_unit_in_a_certificate_is_refused(
+    old: str, new: str, words: str, tmp_path: Path, refusal: Refusal
+) -> None:
+    table = printed(tmp_path / "c.toml", 153.0, TABLE)
+    text = f'{table.read_text()}[[fiducial]]\nid = "1"\nxy_mm = [-106, 106]\n'
+    assert old in text
+    table.write_text(text.replace(old, new))
+    assert words in refusal("import", "certificate", table, tmp_path / "out")
 
 
 def test_two_principal_points_of_a_certificate_are_one_lens(tmp_path: Path) -> None:
