@@ -287,7 +287,7 @@ def test_what_a_calibration_does_not_say_is_no_knowledge(tmp_path: Path, capsys:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("= 153.0", "= 0.153", "reaches from the axis to 0.1284 mm"),
+        ("= 153.0", "= 0.153", "reaches from the axis to 0.1314 mm"),
         ("= 153.0", "= 15.3", "to 12.84 mm (40 degrees), the fiducials to 149.9 mm"),
         (str(ANGLES), "[0.13, 0.26, 0.40, 0.52, 0.61, 0.70]", "Give degrees and mm"),
         (str(TABLE), "[0.003, 0.004, 0.001, -0.003, -0.004, 0.003]", "is 0.004 µm at most. Give µm"),
