@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import networks as nets
@@ -176,7 +177,7 @@ def test_what_is_removed_is_named_and_has_no_influence() -> None:
 def test_wrong_given_values_are_named() -> None:
     network, start = checkable(2)
     spoilt = spoil_fiducial(spoil_control(network, 1.0), 0.15)
-    for options in (Options(), Options(snooping=True), Options(robust="igg3")):
+    for options in (Options(), Options(robust="igg3")):
         assert named(adjust(spoilt, start, options)) == ["control point 5 Z", "given fiducial 3 (camera K)"]
 
 
@@ -187,8 +188,11 @@ def test_clean_observations_are_rarely_suspect() -> None:
     assert called <= 3
 
 
-def test_observations_all_worse_than_stated_raise_the_limits_by_the_square_of_their_scale() -> None:
+def test_observations_all_worse_than_stated_raise_the_limits_by_the_square_of_their_scale(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Errors three times as large as they are given: a statistic is a square, so that chance lets it be nine times."""
+    monkeypatch.setattr("adjust.solution.adjustment.blunder_sentence", lambda *_: "")  # which would take longer
     network, start = checkable(3)
     rows = network.observations
     claimed = nets.set_observations(network, covariance_mm2=rows.covariance_mm2 / 9.0)
@@ -506,10 +510,15 @@ def board_network(
     return nets.digital_network(camera, rows, points, SIGMA_MM)
 
 
-@parametrize_with_studies("free", [EIGHT, TWELVE, FOURTEEN], quick=(1,))
+@cache
+def adjusted_board(seed: int, free: tuple[str, ...]) -> Adjustment:
+    return adjust(board_network(seed, free))
+
+
+@parametrize_with_studies("free", [EIGHT, TWELVE, FOURTEEN])
 @parametrize_with_studies("seed", [0, 1])
 def test_an_ordinary_board_gives_a_rational_lens(seed: int, free: tuple[str, ...]) -> None:
-    result = adjust(board_network(seed, free))
+    result = adjusted_board(seed, free)
     assert result.converged
     assert result.iterations < 60
     # With thin prisms free, too, the principal point lies in a curved valley: it is up to 3.4 of its claims off.
@@ -528,7 +537,7 @@ def test_an_ordinary_board_gives_a_rational_lens(seed: int, free: tuple[str, ...
 
 def test_how_far_out_the_lens_is_known() -> None:
     """The outermost corner of the board against the picture's, and a standard deviation that grows beyond."""
-    result = adjust(board_network(0, EIGHT))
+    result = adjusted_board(0, EIGHT)
     camera = result.network.cameras[0]
     reach = result.lens_reach(camera, (float(FRAME_MM[0]), float(FRAME_MM[1])))
     assert reach is not None

@@ -87,15 +87,18 @@ Singles = NDArray[np.float32]
 POINTS, KEPT = 32, 8  # along a pixel's side; asked, and left for the blur
 
 
-def brute_picture(mark: MarkShape, pixel_from_mark: Array, width: int, height: int, blur_px: float) -> Array:
-    """(height, width) shares of the pixels inside of the mark, after a Gaussian blur."""
+def brute_picture(
+    mark: MarkShape, pixel_from_mark: Array, width: int, height: int, blur_px: float, points: int = POINTS
+) -> Array:
+    """(height, width) shares of the pixels inside of the mark, after a Gaussian blur; of so many points along a
+    pixel's side."""
     reach = int(np.ceil(5 * blur_px)) + 1
     corners = np.concatenate([corners_mm(part) for part in mark.parts])
     # No blur reaches farther from the mark: all else stays dark.
     (col0, row0), (col1, row1) = (np.clip(xy, 0, (width, height)) for xy in bounds_px(corners, pixel_from_mark, reach))
     picture = np.zeros((height, width))
     moved = pixel_from_mark - np.array([[0, 0, col0], [0, 0, row0]])
-    picture[row0:row1, col0:col1] = _brute_picture(mark, moved, col1 - col0, row1 - row0, blur_px, reach)
+    picture[row0:row1, col0:col1] = _brute_picture(mark, moved, col1 - col0, row1 - row0, blur_px, reach, points)
     return picture
 
 
@@ -106,23 +109,25 @@ def bounds_px(corners: Array, pixel_from_mark: Array, spare_px: int) -> tuple[ND
     return np.floor(places.min(axis=0)).astype(int) - spare_px, np.ceil(places.max(axis=0)).astype(int) + 1 + spare_px
 
 
-def _brute_picture(mark: MarkShape, pixel_from_mark: Array, width: int, height: int, blur_px: float, pad: int) -> Array:
+def _brute_picture(
+    mark: MarkShape, pixel_from_mark: Array, width: int, height: int, blur_px: float, pad: int, points: int
+) -> Array:
     rows, cols = height + 2 * pad, width + 2 * pad
-    inside = np.zeros((rows * POINTS, cols * POINTS), dtype=bool)
+    inside = np.zeros((rows * points, cols * points), dtype=bool)
     mark_from_pixel = np.linalg.inv(pixel_from_mark[:, :2])
     for part in mark.parts:
         first, last = (
-            np.clip(c + pad, 0, (cols, rows)) * POINTS for c in bounds_px(corners_mm(part), pixel_from_mark, 1)
+            np.clip(c + pad, 0, (cols, rows)) * points for c in bounds_px(corners_mm(part), pixel_from_mark, 1)
         )
         col, row = (
-            ((np.arange(a, b) + 0.5) / POINTS - 0.5 - pad - center).astype(np.float32)  # to a millionth of a pixel
+            ((np.arange(a, b) + 0.5) / points - 0.5 - pad - center).astype(np.float32)  # to a millionth of a pixel
             for a, b, center in zip(first, last, pixel_from_mark[:, 2], strict=True)
         )
         box = inside[first[1] : last[1], first[0] : last[0]]
         for strip, down in zip(encode_strips(box, len(col)), encode_strips(row, len(col)), strict=True):
             x, y = (line[0] * col[None, :] + line[1] * down[:, None] for line in mark_from_pixel.astype(np.float32))
             strip |= is_inside(part, x, y)
-    step = POINTS // KEPT
+    step = points // KEPT
     rowwise = np.asarray(np.sum([inside[k::step] for k in range(step)], axis=0, dtype=np.uint8))
     counts = np.asarray(np.sum([rowwise[:, k::step] for k in range(step)], axis=0, dtype=np.uint8))
     return pixel_means(counts / step**2, blur_px, KEPT, pad)
@@ -232,7 +237,7 @@ def paint(
     center = matrix @ (*xy_mm, 1.0)
     col0, row0 = np.rint(center).astype(int) - half
     place, size = np.column_stack([matrix[:, :2], center - (col0, row0)]), 2 * half + 1
-    shown = brute_picture(mark, place, size, size, blur_px)
+    shown = brute_picture(mark, place, size, size, blur_px, POINTS // 2)
     rows, cols = np.mgrid[row0 : row0 + size, col0 : col0 + size]
     inside = (rows >= 0) & (cols >= 0) & (rows < grey.shape[0]) & (cols < grey.shape[1])
     grey[rows[inside], cols[inside]] += contrast * shown[inside]

@@ -8,6 +8,7 @@ import pytest
 from drawn import Array, brute_picture, center, chi_square, make_scan, placed
 from scipy import ndimage
 from scipy.ndimage import gaussian_filter
+from studies import parametrize_with_studies
 from true_marks import KIND, some_mark
 
 from measure import FiducialOptions, MatchOptions
@@ -48,7 +49,7 @@ def test_a_cross_of_the_grounds_own_contrast_is_measured_with_an_honest_sigma() 
     grey, true = textured(0), places(0)
     for place in true:
         col0, row0 = np.rint(place).astype(int) - 25
-        shown = brute_picture(CROSS, np.column_stack([LINEAR, place - (col0, row0)]), 51, 51, 0.7)
+        shown = brute_picture(CROSS, np.column_stack([LINEAR, place - (col0, row0)]), 51, 51, 0.7, 16)
         grey[row0 : row0 + 51, col0 : col0 + 51] -= 5000 * shown
     for found, place in zip(detect_marks(grey, np.rint(true)), true, strict=True):
         assert found is not None
@@ -106,7 +107,7 @@ def test_what_answers_at_the_edge_of_a_wide_search_is_placed_within_the_window()
     grey, place = textured(4), places(4)[12]
     grey -= 6000 * brute_picture(wide, np.column_stack([LINEAR, place]), grey.shape[1], grey.shape[0], 0.7)
     scan = make_scan(grey)
-    for off_px in np.arange(38.0, 42.0, 0.5):
+    for off_px in np.arange(38.0, 42.0, 1.0):
         predicted = np.column_stack([LINEAR, place + np.array([off_px, 0.3])])
         detect_faint(scan, MarkPrediction(wide, predicted, 38.2, -1), 0.0, 0.7)
 
@@ -146,7 +147,7 @@ def test_what_the_tone_curve_moves_a_faint_mark_by_is_in_its_covariance() -> Non
 GROUND, CONTRAST = 25000.0, 15000.0
 
 
-@pytest.mark.parametrize("texture_px", [0.0, 1.0, 3.0])
+@parametrize_with_studies("texture_px", [0.0, 1.0, 3.0], quick=(0, 2))
 def test_noise_is_rarely_worth_a_fit_however_coarse_it_is(texture_px: float) -> None:
     rng = np.random.default_rng(1)
     marks = [some_mark(KIND[name], 1.0, rng) for name in ("cross", "ring-dot", "dot")]
@@ -162,14 +163,13 @@ def test_noise_is_rarely_worth_a_fit_however_coarse_it_is(texture_px: float) -> 
 
 def test_a_soft_mark_that_hardly_stands_out_of_the_noise_is_measured() -> None:
     rng = np.random.default_rng(2)
-    for _ in range(3):
-        mark = some_mark(KIND["gap cross"], 2.5, rng)
-        grey = GROUND + CONTRAST * (mark.picture + rng.standard_normal((mark.size, mark.size)) / 5)
-        start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + rng.uniform(-1, 1, 2)])
-        fit = detect_mark(make_scan(grey), MarkPrediction(mark.kind.shape, start, 3.0, 1), FiducialOptions().match).fit
-        assert chi_square(fit, mark.place[:, 2]) < 13.8
-        assert fit is not None
-        assert np.trace(fit.covariance_px2) < 1.5**2 * np.trace(mark.bound(0.2))
+    mark = some_mark(KIND["gap cross"], 2.5, rng)
+    grey = GROUND + CONTRAST * (mark.picture + rng.standard_normal((mark.size, mark.size)) / 5)
+    start = np.column_stack([mark.place[:, :2], mark.place[:, 2] + rng.uniform(-1, 1, 2)])
+    fit = detect_mark(make_scan(grey), MarkPrediction(mark.kind.shape, start, 3.0, 1), FiducialOptions().match).fit
+    assert chi_square(fit, mark.place[:, 2]) < 13.8
+    assert fit is not None
+    assert np.trace(fit.covariance_px2) < 1.5**2 * np.trace(mark.bound(0.2))
 
 
 def test_a_line_far_thinner_than_a_pixel_is_not_detected_in_noise_and_warns_of_nothing() -> None:

@@ -206,7 +206,7 @@ def test_predicted_marks_are_not_written_as_measured() -> None:
     col, row = np.rint(matrix @ (*draw.CORNERS[2], 1.0)).astype(int)
     rng = np.random.default_rng(3)
     grey[row - 30 : row + 31, col - 30 : col + 31] = 3000 + rng.normal(0, draw.NOISE_DN, (61, 61))
-    result = draw.measure_grey(grey, draw.ALIKE)
+    result = draw.measure_grey(grey, draw.ALIKE, FiducialOptions(pose="0"))
     covered = result.marks[2]
     assert covered.status is Status.PREDICTED
     assert covered.reason
@@ -233,7 +233,7 @@ def test_the_neighbouring_frames_marks_are_not_taken_for_this_frames() -> None:
     neighbour[0, 2] += 18.5 * draw.PX_PER_MM
     for place in draw.CORNERS[1:3]:  # its left marks reach into this scan, brighter than our own
         draw.paint(grey, MarkShape(draw.RING_CROSS), place, neighbour, 14000.0)
-    result = draw.measure_grey(grey, draw.ALIKE)
+    result = draw.measure_grey(grey, draw.ALIKE, FiducialOptions(pose="0"))
     draw.assert_right(result, draw.ALIKE, matrix)
 
 
@@ -252,7 +252,7 @@ def test_a_mark_off_the_constellation_is_no_observation() -> None:
     given = draw.lay_out(marks, places)
     moved = draw.lay_out(marks, (*places[:5], (0.55, 7.0)))
     matrix = draw.pixel_from_camera("0")
-    result = draw.measure_grey(draw.frame_picture(moved, matrix), given)
+    result = draw.measure_grey(draw.frame_picture(moved, matrix), given, FiducialOptions(pose="0"))
     assert [mark.status for mark in result.marks[:5]] == [Status.MEASURED] * 5
     assert result.marks[5].status is Status.PREDICTED
     assert "no mark like its drawing within 6 px" in result.marks[5].reason

@@ -99,7 +99,7 @@ def measure_picture(camera: shapes.FiducialLayout, picture: Array) -> list[Measu
         (WEDGE_TO_EDGE, WEDGE_MM, False),
         (NOTCH, HALF_MM, True),
     ],
-    quick=(1, 2),
+    quick=(2,),
     ids=["beyond", "with its border", "to the edge", "notch"],
 )
 def test_border_marks_are_measured_as_elsewhere(
@@ -205,7 +205,7 @@ def test_no_corner_is_visible_in_a_landscape() -> None:
     assert "edge of the frame" in fit.reason
 
 
-@pytest.mark.parametrize("gamma", [1.0, 2.2])
+@parametrize_with_studies("gamma", [1.0, 2.2], quick=(1,))
 def test_a_corner_moves_with_the_tone_curve_as_its_edges_say(gamma: float) -> None:
     corner = shapes.frame_corner((-10.0, 10.0), 5.0)
     start = np.column_stack([MATRIX[:, :2], MATRIX @ (-10.0, 10.0, 1.0)])
@@ -279,7 +279,10 @@ def plate() -> Array:
             covered = np.maximum(covered, line * ndtr((11.5 - np.abs(along)) / blur_mm))
     stars = [(place, 1.0, 0.1) for place in rng.uniform(-14, 14, (120, 2))]
     stars += [(np.add(places_mm()[name], off), 20.0, 0.3) for name, off in BRIGHT.items()]
-    density = sum(h * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / 2 / sigma**2) for at, h, sigma in stars)
+    density, edge = np.zeros(rows.shape), np.arange(SIZE_PX)
+    for at, height, sigma in stars:
+        col, row = (np.exp(-0.5 * ((edge - px) / LINES_PX_PER_MM / sigma) ** 2) for px in to_px(np.array(at)))
+        density += height * np.outer(row, col)
     ground = 45000.0 - 9000.0 * covered
     return np.asarray(ground - (ground - 6000.0) * (1 - np.exp(-density)) + rng.normal(0, 300, rows.shape))
 
@@ -385,7 +388,7 @@ def test_errors_are_as_large_as_their_sigmas_say(blur_px: float, alone: bool) ->
 def test_what_jpeg_does_to_edges_is_in_the_standard_deviations(quality: int, alone: bool) -> None:
     """Residuals alone make them 2.5 and 2.3 times too small."""
     rng, errors = np.random.default_rng(5), []
-    for _ in range(32):
+    for _ in range(20):
         center, steps = CORNER_SIZE // 2 + rng.uniform(-4, 4, 2), board_steps(rng)
         clean = square_picture(center, steps, 0.8, alone)
         noisy = np.rint(clean + rng.normal(0, 1.0, clean.shape)).astype(np.uint8)
@@ -394,8 +397,8 @@ def test_what_jpeg_does_to_edges_is_in_the_standard_deviations(quality: int, alo
         corner = fit_mark(grey, center, steps, alone, quantisation_step_dn(stored.tobytes()))
         if not corner.reason:
             errors.append(whitened(corner.center_px - center, corner.covariance.px2))
-    assert len(errors) >= 29
-    assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.25  # 60 numbers: 9 % standard deviation
+    assert len(errors) >= 18
+    assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.25  # 40 numbers: 11 % standard deviation
 
 
 def test_a_corner_of_a_part_is_known_as_well_as_in_the_whole_picture() -> None:

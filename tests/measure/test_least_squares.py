@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
@@ -145,10 +146,10 @@ def fits(scale: float, turn: float, sigma: float, count: int) -> list[MarkFit]:
 
 
 def test_noise_alone_moves_them_by_their_standard_deviations() -> None:
-    own = [fit.own_shape for fit in fits(0.0, 0.0, 25.0, 40)]
+    own = [fit.own_shape for fit in fits(0.0, 0.0, 25.0, 24)]
     ratios = np.array([shape.change / shape.sigma for shape in own if shape is not None])
-    assert len(ratios) == 40
-    assert 0.8 < np.sqrt(np.mean(ratios**2)) < 1.2  # 80 numbers: 1 within 2.5 of its standard deviations
+    assert len(ratios) == 24
+    assert 0.75 < np.sqrt(np.mean(ratios**2)) < 1.25  # 48 numbers: 1 within 2.5 of its standard deviations
 
 
 def test_another_size_and_turn_are_reported_and_how_they_move_the_place() -> None:
@@ -287,8 +288,7 @@ def test_sigmas_are_those_of_the_errors(name: str, blur_px: float, count: int) -
     assert np.abs(errors.mean(axis=0)).max() < 4 * sigmas.mean() / np.sqrt(len(errors))
 
 
-@pytest.mark.parametrize("name", MARKS)
-@pytest.mark.parametrize("blur_px", [0.6, 1.2])
+@parametrize_with_studies(("name", "blur_px"), list(product(MARKS, (0.6, 1.2))), quick=(0, 3, 4, 7))
 def test_clean_marks_are_unbiased_at_every_phase(name: str, blur_px: float) -> None:
     """Trap: a 0.1 px grid left by sub-pixel refinement, and a half pixel lost in refining."""
     rng = np.random.default_rng(7)
@@ -302,12 +302,12 @@ def test_clean_marks_are_unbiased_at_every_phase(name: str, blur_px: float) -> N
 def test_dust_is_cut_out() -> None:
     rng = np.random.default_rng(13)
     clean, dusty, ratios, fractions = [], [], [], []
-    for index in range(18):
+    for index in range(12):
         shown, place = draw_mark("ring-cross", 1.0)[index % PHASES]
         grey = GROUND + CONTRAST * shown + rng.normal(0, 25, shown.shape)
         clean.append(measure_picture(grey, MARKS["ring-cross"], place, rng).center_px - place[:, 2])
         for _ in range(3):
-            speck = brute_picture(MarkShape(dot(0.2)), placed(SCALE, tuple(rng.uniform(6, 35, 2))), SIZE, SIZE, 0.7)
+            speck = brute_picture(MarkShape(dot(0.2)), placed(SCALE, tuple(rng.uniform(6, 35, 2))), SIZE, SIZE, 0.7, 16)
             grey = grey + 1.5 * CONTRAST * speck
         fit = measure_picture(grey, MARKS["ring-cross"], place, rng)
         dusty.append(fit.center_px - place[:, 2])
@@ -344,7 +344,7 @@ def test_a_mark_half_of_which_was_redrawn_has_the_shift_in_its_sigma(name: str) 
 def test_sigmas_hold_in_correlated_grain(grain_px: float) -> None:
     rng = np.random.default_rng(17)
     ratios = []
-    for index in range(36):
+    for index in range(24):
         shown, place = draw_mark("ring-cross", 1.0)[index % PHASES]
         grain = gaussian_filter(rng.normal(0, 1, (SIZE, SIZE)), grain_px, mode="wrap")
         fit = measure_picture(GROUND + CONTRAST * shown + 25 * grain / grain.std(), MARKS["ring-cross"], place, rng)
@@ -352,7 +352,7 @@ def test_sigmas_hold_in_correlated_grain(grain_px: float) -> None:
         assert not fit.covariance_is_white
         error = fit.center_px - place[:, 2]
         ratios.append(error / np.sqrt(np.diag(fit.covariance_px2)))
-    assert 0.85 < np.sqrt(np.mean(np.square(ratios))) < 1.25  # 72 numbers: 8.3 % standard deviation
+    assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.3  # 48 numbers: 10 % standard deviation
 
 
 def test_a_drawing_is_fitted_where_it_is_true() -> None:

@@ -18,6 +18,7 @@ from drawn import (
     paint,
     pixel_from_camera,
 )
+from studies import parametrize_with_studies
 from true_marks import KIND, TrueMark, some_mark
 
 from measure import FiducialLayout, FiducialOptions, LayoutMark, MarkShape, Status, cross
@@ -64,7 +65,7 @@ def test_a_mark_exposed_twice_may_lie_where_either_exposure_does() -> None:
     assert off @ np.linalg.solve(claimed, off) < 4
 
 
-@pytest.mark.parametrize("apart_px", [0.0, 0.2, 3.0])
+@parametrize_with_studies("apart_px", [0.0, 0.2, 3.0], quick=(1, 2))
 def test_a_mark_whose_ring_lies_apart_from_its_lines_may_lie_where_either_does(apart_px: float) -> None:
     """In all four marks alike, so that no mark differs from the others."""
     matrix = pixel_from_camera("0")

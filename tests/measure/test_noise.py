@@ -52,7 +52,7 @@ def test_a_light_mark_is_not_damaged_for_its_noise(alike_in: str) -> None:
     """Noise that is alike in grey values is in light several times as large on the mark as about it."""
     rng = np.random.default_rng(4)
     errors, covariances, damaged = [], [], []
-    for _ in range(24):
+    for _ in range(16):
         mark = some_mark(KIND["ring-cross"], 0.8, rng)
         noise = rng.standard_normal(mark.picture.shape)
         light = 0.02 + 0.7 * mark.picture
@@ -71,7 +71,7 @@ def test_a_light_mark_is_not_damaged_for_its_noise(alike_in: str) -> None:
     assert 0.75 < whitened_rms(errors, covariances) < 1.3
 
 
-@pytest.mark.parametrize("grain_px", [0.6, 0.8, 1.1])
+@parametrize_with_studies("grain_px", [0.6, 0.8, 1.1], quick=(1,))
 def test_variance_and_power_of_grain_are_found_behind_a_fit_that_took_most_of_it(grain_px: float) -> None:
     rng = np.random.default_rng(1)
     size = 19
@@ -175,7 +175,7 @@ def test_the_sigma_of_a_mark_on_ground_just_at_the_end_of_the_range_is_honest() 
     rng = np.random.default_rng(5)
     mark = some_mark(KIND["ring-dot"], 1.0, rng)
     errors, covariances, best = [], [], []
-    for _ in range(24):
+    for _ in range(14):
         noise = rng.standard_normal((mark.size, mark.size)) / 20
         fit = sighted(mark, CLIPPING_FULL + CONTRAST * (noise - mark.picture))
         errors.append(fit.center_px - mark.place[:, 2])

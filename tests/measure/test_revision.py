@@ -6,7 +6,8 @@ import ast
 import json
 import pickle
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -131,7 +132,7 @@ def test_every_reason_of_the_code_has_a_code() -> None:
     """Each call of Reason in measure and pipeline: a sentence, then at least one code."""
     calls = [
         (f"{file.relative_to(ROOT)}:{node.lineno}", len(node.args))
-        for file, node in matching_nodes("Reason(")
+        for file, node in nodes()
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Reason"
     ]
     assert len(calls) > 80
@@ -141,19 +142,20 @@ def test_every_reason_of_the_code_has_a_code() -> None:
 def test_every_code_is_used() -> None:
     used = {
         node.attr
-        for file, node in matching_nodes("Code.")
+        for file, node in nodes()
         if file.name != "flags.py"
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "Code"
     }
     assert used == set(Code.__members__)
 
 
-def matching_nodes(text: str) -> Iterator[tuple[Path, ast.AST]]:
-    for package in ("measure", "pipeline"):
-        for file in (ROOT / package).rglob("*.py"):
-            content = file.read_text()
-            if text in content:
-                yield from ((file, node) for node in ast.walk(ast.parse(content)))
+@cache
+def nodes() -> list[tuple[Path, ast.AST]]:
+    """Of the files of measure and pipeline that name a reason or a code."""
+    files = [file for package in ("measure", "pipeline") for file in (ROOT / package).rglob("*.py")]
+    contents = {file: file.read_text() for file in files}
+    named = {file: each for file, each in contents.items() if "Reason(" in each or "Code." in each}
+    return [(file, node) for file, each in named.items() for node in ast.walk(ast.parse(each))]
 
 
 def test_joined_reasons_keep_their_codes_once_each() -> None:

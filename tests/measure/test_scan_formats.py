@@ -51,9 +51,13 @@ def test_every_storage_gives_the_same_values(
     np.testing.assert_array_equal(window, truth[50:123, 40:101])
 
 
-@pytest.mark.parametrize("compression", ["lzw", "deflate", "zstd"])
 @pytest.mark.parametrize(
-    "options", [{"rowsperstrip": 1624, "byteorder": ">"}, {"rowsperstrip": 900}, {"tile": (1024, 2560)}]
+    ("compression", "options"),
+    [
+        ("lzw", {"rowsperstrip": 1624, "byteorder": ">"}),
+        ("deflate", {"rowsperstrip": 900}),
+        ("zstd", {"tile": (1024, 2560)}),
+    ],
 )
 def test_strips_and_tiles_of_megabytes(tmp_path: Path, compression: str, options: dict[str, Any]) -> None:
     """In one; in two, the last of them a shorter one; in two of which the last reaches beyond the picture."""
@@ -344,10 +348,12 @@ def test_signed_numbers_keep_their_values_and_negative_ones_are_black(tmp_path: 
 
 
 @pytest.mark.parametrize(("greatest", "full"), [(1.0, 1.0), (0.7, 1.0), (255.0, 255.0), (40000.0, 65535.0), (1e6, 1e6)])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize(
-    "options",
-    [{}, {"rowsperstrip": 7, "compression": "lzw"}, {"tile": (64, 48), "compression": "zlib", "predictor": True}],
+    ("dtype", "options"),
+    [
+        (np.float32, {"rowsperstrip": 7, "compression": "lzw"}),
+        (np.float64, {"tile": (64, 48), "compression": "zlib", "predictor": True}),
+    ],
 )
 def test_floating_point_is_scaled_by_what_its_numbers_are(
     tmp_path: Path, greatest: float, full: float, dtype: type[np.floating[Any]], options: dict[str, Any]

@@ -201,7 +201,7 @@ def test_marks_say_how_well_the_frame_s_stretch_and_shear_are_known_that_move_th
     errors, covariances, best, bounds = [], [], [], []
     for kind in (KIND["wedge"], KIND["wing"], Kind("identification dots", dots, ALL_MOVES)):
         true = some_mark(replace(kind, known=roughly), 1.0, rng)
-        for _ in range(6):
+        for _ in range(4):
             unit = rng.standard_normal((true.size, true.size)) / 200
             off = rng.normal(0, roughly, len(ALL_MOVES))
             result = (np.eye(2) + np.tensordot(off, np.reshape(ALL_MOVES, (-1, 2, 2)), 1)) @ true.place[:, :2]
@@ -219,13 +219,13 @@ def test_faint_soft_disks_are_at_the_bound() -> None:
     rng = np.random.default_rng(7)
     mark = some_mark(KIND["ellipse"], 2.5, rng)
     beyond = []
-    for _ in range(10):
+    for _ in range(6):
         noise = rng.standard_normal((mark.size, mark.size)) / 5
         start = mark.place[:, 2] + rng.normal(0, 0.4, 2), mark.place[:, :2] * rng.uniform(0.9, 1.1)
         disk = fit_disk(make_scan(GROUND + PRECISION_CONTRAST * (mark.picture + noise)), *start)
         assert not disk.reason
         beyond.append(disk.center_px - mark.place[:, 2] - mark.best_errors(noise, 1 / 5))
-    assert np.square(beyond).sum() < 10 * 0.3 * np.trace(mark.bound(1 / 5))
+    assert np.square(beyond).sum() < 6 * 0.3 * np.trace(mark.bound(1 / 5))
 
 
 def test_wings_take_rotation_and_scale_from_their_frame() -> None:
@@ -250,7 +250,8 @@ def test_wings_take_rotation_and_scale_from_their_frame() -> None:
         grey[corner[1] : corner[1] + 81, corner[0] : corner[0] + 81] += PRECISION_CONTRAST * shown
         true.append(center)
     grey += 150 * rng.standard_normal(grey.shape)
-    result = measure_fiducials(make_scan(grey), shapes.FiducialLayout(marks, (60.0, 60.0)), (100.7, 100.7))
+    layout = shapes.FiducialLayout(marks, (60.0, 60.0))
+    result = measure_fiducials(make_scan(grey), layout, (100.7, 100.7), FiducialOptions("0"))
     errors = [np.asarray(mark.center_px) - place for mark, place in zip(result.marks, true, strict=True)]
     assert np.sqrt(np.mean(np.square(errors))) < 0.009  # of a placement's rotation alone: 0.012 and more
 

@@ -122,19 +122,17 @@ def test_a_declared_curve_holds_until_pictures_contradict_it() -> None:
 def test_the_tip_of_a_wedge_is_where_it_was_drawn_whatever_the_curve(curve: float | str) -> None:
     rng = np.random.default_rng(3)
     errors, covariances, off = [], [], []
-    for _ in range(2):
-        marks = [some_mark(TIP, 1.0, rng) for _ in range(4)]
-        codes = [encode_mark(mark, curve, 80.0, rng) for mark in marks]
-        fits, found = settled(marks, codes, Tone.unknown())
-        for mark, fit in zip(marks, fits, strict=True):
-            assert fit.tone is not None
-            errors.append(fit.center_px - mark.place[:, 2])
-            covariances.append(fit.covariance_px2 + found.covariance_px2(fit.tone))
-            axis = mark.place[:, 1] / np.hypot(*mark.place[:, 1])
-            off.append(float(errors[-1] @ axis))
-            assert np.hypot(*errors[-1]) < 5 * np.sqrt(np.linalg.eigvalsh(covariances[-1])[-1])
+    marks = [some_mark(TIP, 1.0, rng) for _ in range(4)]
+    codes = [encode_mark(mark, curve, 80.0, rng) for mark in marks]
+    fits, found = settled(marks, codes, Tone.unknown())
+    for mark, fit in zip(marks, fits, strict=True):
+        assert fit.tone is not None
+        errors.append(fit.center_px - mark.place[:, 2])
+        covariances.append(fit.covariance_px2 + found.covariance_px2(fit.tone))
+        axis = mark.place[:, 1] / np.hypot(*mark.place[:, 1])
+        off.append(float(errors[-1] @ axis))
     assert abs(np.mean(off)) < 0.15  # taken as light: 0.5 to 1 px
-    assert whitened_rms(errors, covariances) < 2.2  # of two scans, in fact: the tips of one are off together
+    assert whitened_rms(errors, covariances) < 2.2  # of one scan, whose tips are off together
 
 
 def test_a_refit_weighs_noise_that_grows_with_light_as_a_fit_from_scratch_does() -> None:
@@ -186,7 +184,7 @@ def test_noise_that_is_cut_off_at_black_feigns_no_curve() -> None:
     light, and an edge out of it as bent as by a curve."""
     rng = np.random.default_rng(11)
     linear, moved = Tone(power(1.0), covariance=np.eye(5)), []
-    for _ in range(12):
+    for _ in range(8):
         mark = some_mark(TIP, 1.3, rng)
         light = 0.02 + 0.5 * (mark.picture + rng.standard_normal(mark.picture.shape) / 12)
         estimate = fit_mark(mark, FULL * np.clip(light, 0.0, 1.0), linear).tone
@@ -556,7 +554,7 @@ def stored_after_jpeg(picture: NDArray[np.uint8], quality: int) -> NDArray[np.ui
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED), np.uint8)
 
 
-@pytest.mark.parametrize(("quality", "share"), [(50, 1.0), (75, 0.5), (90, 0.2)])
+@parametrize_with_studies(("quality", "share"), [(50, 1.0), (75, 0.5), (90, 0.2)])
 def test_a_file_without_loss_tells_that_its_picture_was_jpeg(quality: int, share: float, tmp_path: Path) -> None:
     """Cropped, in colour, in 16 bits; and stored as a finer JPEG."""
     was = stored_after_jpeg(film(), quality)[3:, 5:]
@@ -578,17 +576,13 @@ def test_a_file_without_loss_tells_that_its_picture_was_jpeg(quality: int, share
 def test_faint_marks_that_jpeg_rounds_are_as_far_off_as_is_stated() -> None:
     """Of a contrast of three, four and six rounding steps: the rms error over the claim, both measured at once. What
     residuals do not show falls with the square of the contrast: one that fell with it would be twice too large."""
-    rng, mark, ratios = (
-        np.random.default_rng(2),
-        measure.MarkShape(measure.ring_cross(1.0, 0.2, 1.6, 0.15, angle_deg=45.0)),
-        [],
-    )
+    rng, mark, ratios = np.random.default_rng(2), KIND["ring-cross"].shape, []
     even = np.zeros((48, 48), np.uint8)
     step_dn = quantisation_step_dn(cv2.imencode(".jpg", even, (cv2.IMWRITE_JPEG_QUALITY, 30))[1].tobytes())
-    for number in range(24):
+    for number in range(18):
         middle = 23.5 + rng.uniform(-4, 4, 2)
         place = placed(10.0, (middle[0], middle[1]), rng.uniform(0.02, 0.05))
-        picture, noise = brute_picture(mark, place, 48, 48, 1.2), rng.normal(0, 3, (48, 48))
+        picture, noise = brute_picture(mark, place, 48, 48, 1.2, 16), rng.normal(0, 3, (48, 48))
         contrast_dn = (3, 4, 6)[number % 3] * step_dn
         grey = np.clip(np.rint(60 + contrast_dn * picture + noise), 0, 255).astype(np.uint8)
         start = placed(10.0, tuple(place[:, 2] + rng.uniform(-0.5, 0.5, 2)))
