@@ -57,6 +57,8 @@ def rendered_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (scenes / name).write_text("[[image]]".join([head, *images[:FRAMES]]))
     folder = tmp_path_factory.mktemp("demo")
     render_project(scenes / "demo.toml", folder)
+    with (folder / "project.toml").open("a") as project:
+        project.write('[measure]\ntone = "linear"\n')
     return folder
 
 
@@ -66,7 +68,7 @@ def finished(rendered_demo: Path, tmp_path_factory: pytest.TempPathFactory) -> t
     folder = tmp_path_factory.mktemp("finished") / "demo"
     shutil.copytree(rendered_demo, folder)
     with pools(worker_pool):
-        return folder, run(["run", str(folder / "project.toml")])
+        return folder, run(["run", str(folder / "project.toml"), "--workers", "1"])
 
 
 @pytest.fixture

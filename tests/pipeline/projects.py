@@ -71,7 +71,7 @@ CAMERA = (
     + fiducial_tables(PLACES, 'sigma_mm = 0.01\nmark = "m"\n')
     + '[mark.m]\nkind = "ring-cross"\nring_mm = 0.5\nring_line_mm = 0.1\narm_mm = 0.8\nline_mm = 0.1\n'
 )
-PROJECT = f'camera = "camera.toml"\nscans = ["*.tif"]\npitch_um = {PITCH_UM}\n[measure]\npose = "0"\n'
+PROJECT = f'camera = "camera.toml"\nscans = ["*.tif"]\npitch_um = {PITCH_UM}\n[measure]\npose = "0"\ntone = "linear"\n'
 
 
 def write_project(folder: Path, names: Sequence[str], project: str = PROJECT, layout: FiducialLayout = ALIKE) -> Path:

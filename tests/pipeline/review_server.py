@@ -1,22 +1,30 @@
-"""A review of a small project, served by a process of its own, and what a person does on its page."""
+"""A review of a small project, served by a thread, and what a person does on its page."""
 
 import csv
 import http.client
 import json
-import subprocess
-import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 from urllib.parse import urlsplit
 
 import numpy as np
 import tifffile
+import uvicorn
 from drawn import ALIKE, CORNERS, NOISE_DN, Array, frame_picture, pixel_from_camera
 from playwright.sync_api import Page
-from projects import CAMERA, PROJECT
+from projects import CAMERA, PROJECT, command
+
+from measure.fiducials.stages import find_frame
+from measure.flags import NO_REASON
+from pipeline.files.project_file import read_undrawn
+from pipeline.review.server import serve
 
 GOOD, BARE, SCRATCHED, TURNED = "good", "<img src=x onerror=alert(1)>", "scratched", "turned"
 FAR_TURN_RAD = 0.35  # of TURNED: no search looks for a frame that is laid so
@@ -39,6 +47,20 @@ def write_faults(folder: Path) -> Path:
     return folder / "project.toml"
 
 
+def measured_faults(folder: Path) -> Path:
+    """The folder of these frames, measured. The long search that fails in the last one is left out."""
+    project = write_faults(folder)
+
+    def found(scan: Any, *rest: Any) -> Any:
+        if scan.name == TURNED:
+            return SimpleNamespace(frame=None, result=None, misfit=NO_REASON)
+        return find_frame(scan, *rest)
+
+    with patch("measure.fiducials.measurement.find_frame", found):
+        assert command("measure", project) == 1
+    return folder
+
+
 def mark_matrix(name: str) -> Array:
     """Camera mm to pixels, as the frame was drawn."""
     return pixel_from_camera("0", FAR_TURN_RAD if name == TURNED else 0.004)
@@ -54,7 +76,6 @@ class Served:
     """address: with its token."""
 
     address: str
-    process: subprocess.Popen[str]
 
     @property
     def origin(self) -> str:
@@ -62,18 +83,25 @@ class Served:
 
 
 @contextmanager
-def served(project: Path, port: int = 0) -> Iterator[Served]:
-    """`reseau review`, until the block ends."""
-    start = "from pipeline.main import main; main()"
-    command = [sys.executable, "-c", start, "review", str(project), "--no-browser", "--who", "ann"]
-    with subprocess.Popen([*command, "--port", str(port)], stdout=subprocess.PIPE, text=True) as process:
+def served(project: Path) -> Iterator[Served]:
+    """What `reseau review` serves, until the block ends."""
+    addresses, servers = SimpleQueue[str](), list[uvicorn.Server]()
+
+    class Kept(uvicorn.Server):
+        def __init__(self, config: uvicorn.Config) -> None:
+            super().__init__(config)
+            servers.append(self)
+
+    with patch.object(uvicorn, "Server", Kept):
+        thread = Thread(target=serve, args=(read_undrawn(project), 0, "ann", False, addresses.put))
+        thread.start()
+        address = addresses.get(timeout=60)
+        assert address.startswith("http://127.0.0.1:"), address
         try:
-            assert process.stdout is not None
-            address = process.stdout.readline().strip()
-            assert address.startswith("http://127.0.0.1:"), address
-            yield Served(address, process)
+            yield Served(address)
         finally:
-            process.kill()
+            servers[0].should_exit = servers[0].force_exit = True
+            thread.join()
 
 
 def steer(page: Page, view: str, place_px: Array) -> None:

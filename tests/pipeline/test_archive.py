@@ -97,7 +97,7 @@ CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "one more": (one_more, "d"),
     "one less": (lambda p: (p / "b.tif").unlink(), ""),
     "excluded": (projects.change_project("[measure]", 'exclude = ["b.tif"]\n[measure]'), ""),
-    "an option": (projects.change_project('pose = "0"', 'pose = "0"\ntone = "linear"'), "abc"),
+    "an option": (projects.change_project('tone = "linear"', "tone = 1.01"), "abc"),
     "a mark drawn otherwise": (projects.change_camera("line_mm = 0.1\n", "line_mm = 0.11\n"), "abc"),
     "an option of the adjustment": (projects.change_project("[measure]", "[adjust]\nrobust = true\n[measure]"), ""),
     "the camera's name": (projects.change_camera('name = "K"', 'name = "L"'), ""),
@@ -196,7 +196,7 @@ def test_a_second_measure_waits_for_no_other(folder: Path, refusal: Refusal) -> 
 
 def test_results_come_back_by_options_and_move_with_their_project(folder: Path, tmp_path: Path) -> None:
     before = marks(folder)
-    for old, new in (('pose = "0"', 'pose = "0"\ntone = "linear"'), ('pose = "0"\ntone = "linear"', 'pose = "0"')):
+    for old, new in (('tone = "linear"', "tone = 1.01"), ("tone = 1.01", 'tone = "linear"')):
         projects.replace_text(folder / "project.toml", old, new)
         measure(folder)
         assert len(measured) == 3

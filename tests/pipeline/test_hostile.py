@@ -21,7 +21,7 @@ import pytest
 from hostile import MESSAGE, RESULT, change_bytes, change_json, command_ending, counted
 from networks import simulated
 from projects import POINTS, TRUTH, Capture, adjusted_project, command, make_project, write_project
-from review_server import GOOD, Served, get_cookie, mark_px, request, served, write_faults
+from review_server import GOOD, Served, get_cookie, mark_px, measured_faults, request, served
 from studies import parametrize_with_studies
 
 from adjust import AdjustmentError
@@ -122,9 +122,7 @@ QUERIES: dict[str, dict[str, Any]] = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    project = write_faults(tmp_path_factory.mktemp("requests") / "faults")
-    assert command("measure", project) == 1
-    return project.parent
+    return measured_faults(tmp_path_factory.mktemp("requests") / "faults")
 
 
 def answers(folder: Path, server: Served, trials: int, seed: int) -> Counter[str]:

@@ -88,7 +88,7 @@ def test_scans_have_equal_options_unless_targets_are_sought(tmp_path: Path) -> N
         ("camera", 'name = "K"', 'writing = ["left"]\nname = "K"'),
         ("project", "pitch_um = 50.0", "pitch_um = 50.1"),
         ("project", 'pose = "0"', 'pose = "90"'),
-        ("project", 'pose = "0"', 'pose = "0"\ntone = 2.2'),
+        ("project", 'tone = "linear"', "tone = 2.2"),
         ("project", 'pose = "0"', 'pose = "0"\nwriting = "all"'),
         ("project", 'pose = "0"\n', 'pose = "0"\n[adjust]\nfilm_sigma_um = 9.0\n'),
         ("project", 'pose = "0"\n', f'pose = "0"\n{BOARD}'),

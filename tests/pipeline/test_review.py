@@ -38,9 +38,7 @@ from pipeline.review.session import Filters, Session
 @pytest.fixture(scope="module")
 def measured_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The project's folder, measured once."""
-    project = review.write_faults(tmp_path_factory.mktemp("review") / "faults")
-    assert command("measure", project) == 1
-    return project.parent
+    return review.measured_faults(tmp_path_factory.mktemp("review") / "faults")
 
 
 @pytest.fixture(scope="module")

@@ -1,13 +1,11 @@
 """The store gives back what was kept, takes it whole or not at all, and other programs can read it."""
 
 import os
-import signal
 import sqlite3
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -158,34 +156,30 @@ def test_what_is_no_store_is_refused(path: Path, tmp_path: Path) -> None:
             check_mergeable(tmp_path / "a.db", [tmp_path / name])
 
 
-WRITER = """
-import sys
-from pathlib import Path
-from projects import kept_result
-from pipeline.archive.results_database import ResultsDatabase
-with ResultsDatabase(Path(sys.argv[1])) as database:
-    for seed in range(100_000):
-        database.keep(kept_result(seed), str(seed))
-        print(seed, flush=True)
-"""
+def keep_many(path: Path, told: int) -> None:
+    """Keep results, and tell a pipe of each that is kept, until the process is ended."""
+    with ResultsDatabase(path) as database:
+        for seed in range(100_000):
+            database.keep(kept_result(seed), str(seed))
+            os.write(told, b".")
 
 
+@pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")  # of fork, from Python 3.12 on
 def test_what_was_kept_survives_a_kill_and_nothing_is_half(path: Path) -> None:
-    paths = os.pathsep.join(sys.path)
-    writer = subprocess.Popen(
-        [sys.executable, "-c", WRITER, str(path)], env=os.environ | {"PYTHONPATH": paths}, stdout=subprocess.PIPE
-    )
-    assert writer.stdout is not None
-    output = [writer.stdout.readline() for _ in range(50)]
+    reading, writing = os.pipe()
+    writer = get_context("fork").Process(target=keep_many, args=(path, writing))
+    writer.start()
+    os.close(writing)
+    complete = sum(len(os.read(reading, 1)) for _ in range(50))
     time.sleep(0.05)
-    writer.send_signal(signal.SIGKILL)
-    output += writer.stdout.readlines()
-    writer.wait()
-    writer.stdout.close()
+    writer.kill()
+    while told := os.read(reading, 1000):
+        complete += len(told)
+    writer.join()
+    os.close(reading)
     with ResultsDatabase(path) as database:
         found = database.fingerprints()
-        complete = sum(line.endswith(b"\n") for line in output)
-        assert 40 <= complete <= len(found) <= complete + 1
+        assert 50 <= complete <= len(found) <= complete + 1
         assert all(database.scan(row, "", FOLDER).frame.marks for row in found.values())
         assert database.connection.execute("pragma integrity_check").fetchone() == ("ok",)
 
