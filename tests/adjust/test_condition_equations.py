@@ -22,7 +22,6 @@ from adjust.functional_model.families import parameter_names
 from adjust.functional_model.lens import Decentering, Lens
 from adjust.functional_model.projection import EARTH_RADIUS_M, sight_vectors
 from adjust.functional_model.rotation import rotation_from_vector
-from adjust.model_selection.model_choice import choose
 from adjust.problem.condition_equations import compute, computed_observations, derivatives
 from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.problem.network import Board, Exterior, LineOfSight, Network, ObjectPoint, Transformation
@@ -565,14 +564,3 @@ def test_what_is_no_board_is_refused() -> None:
     twice = replace(network, boards=(*network.boards, Board("other", dict(network.boards[0].places))))
     with pytest.raises(AdjustmentError, match="is on the boards board and other"):
         adjust(twice, approximate(network))
-
-
-@pytest.mark.study
-def test_a_choice_of_models_knows_the_bend() -> None:
-    """k1 is chosen, and left-out points are predicted where the bent board has them."""
-    own = adjust(make_network(np.random.default_rng(3)), approximate(make_network(None)))
-    chosen = choose(own).chosen
-    assert chosen is not None
-    assert chosen.model.parameters == ("k1",)
-    assert chosen.cross_validation is not None
-    assert 0.9 < chosen.cross_validation.sigmas < 1.15

@@ -10,9 +10,9 @@ from networks import halves, simulated
 from numpy.typing import NDArray
 from scipy.optimize import approx_fprime
 
-from adjust import Adjustment, AdjustmentError, Network, Options, Parameter, Prior, adjust, approximate
+from adjust import Adjustment, AdjustmentError, Network, Options, Parameter, adjust, approximate
 from adjust.functional_model.transformation import Film, film_kind, fit_transformation
-from adjust.problem.camera import Fiducial, FiducialDistance
+from adjust.problem.camera import FiducialDistance
 from adjust.problem.network import Image, Transformation
 from adjust.solution.adjustment import _reason
 from adjust.solution.planning import plan
@@ -322,18 +322,6 @@ def test_a_plan_expects_the_form_of_the_distances_and_the_datum_of_the_coordinat
     np.testing.assert_allclose([planned.sigma(each) for each in parameters], datum, rtol=1e-3)
     redundancy = {row.name: row.redundancy for row in planned.adjustment.further}
     np.testing.assert_allclose(list(redundancy.values()), [row.redundancy for row in result.further], atol=1e-4)
-
-
-def test_a_distance_to_a_mark_that_no_image_shows_says_nothing() -> None:
-    rng = np.random.default_rng(8)
-    drawn = observe_distances(nets.draw_frames("affine", 2, 4, 1.0, 0.05, rng), rng)
-    camera = drawn.network.cameras[0]
-    unseen = {**camera.fiducials, "5": Fiducial(Prior(0.0, np.inf), Prior(112.0, np.inf))}
-    distances = (*camera.distances, FiducialDistance("1", "5", 100.0, SIGMA_MM))
-    farther = nets.set_camera(drawn.network, fiducials=unseen, distances=distances)
-    alone, result = (adjust(network, drawn.start) for network in (drawn.network, farther))
-    np.testing.assert_allclose(places(result, 4)[0], places(alone, 4)[0], atol=1e-9)
-    assert len(result.further) == len(alone.further)
 
 
 def errors(halves: nets.Halves, adjustment: Adjustment) -> dict[str, np.ndarray]:

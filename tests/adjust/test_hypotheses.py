@@ -23,22 +23,17 @@ from adjust.solution.result import adjust_problem
 
 QUICK = (
     "lens: no radial term",
-    "lens: k2 held",
     "board stretched",
     "object stretched",
     "disks of another diameter",
     "board bent over a diagonal",
     "focus drifts",
-    "focus breathes with the distance",
     "pictures moved",
-    "rows of an image jump",
     "a row of points shifted",
     "half the board shifted",
-    "numbers of a third of the images one off",
     "k1 held wrong",
     "Z in feet",
     "a point is elsewhere",
-    "mm for m, stations in m",
     "noise too small",
 )
 SOUND = faults.MISFITS[faults.NOTHING]
@@ -46,25 +41,13 @@ SOUND = faults.MISFITS[faults.NOTHING]
 Array = NDArray[np.float64]
 
 
-@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.study)], ids=["board", "deep field"])
+@pytest.mark.parametrize("seed", [2, pytest.param(5, marks=pytest.mark.study)], ids=["board", "deep field"])
 @pytest.mark.parametrize(
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.study) for name in faults.MISFITS]
 )
 def test_what_the_model_lacks_is_named(name: str, seed: int) -> None:
     sentences, _ = faults.misfit_sentences(faults.draw_network(name, seed))
     assert faults.misfit_outcome(name, sentences) == "named", sentences
-
-
-def test_figures_are_those_that_were_planted() -> None:
-    made = faults.scene(6, flat=True)
-    kind = faults.MISFITS["pixels not square"]
-    result = adjust(faults.misfit_network(made, faults.Effects(b1=2e-3), kind, np.random.default_rng(1)))
-    (found,) = result.explanations
-    ratio = float(found.cause.split("their width is ")[1].split(" ")[0])
-    assert ratio == pytest.approx(1.0 / 1.002, abs=3e-4)  # marks stand farther apart in x: a pixel's width is less
-    assert found.sigma0[0] == pytest.approx(result.sigma0)
-    assert found.sigma0[1] == pytest.approx(1.0, abs=0.1)
-    assert found.p < 1e-6
 
 
 @pytest.mark.parametrize("seed", [2, pytest.param(14, marks=pytest.mark.study)])
@@ -81,7 +64,7 @@ def test_nothing_else_is_blamed_with_a_stale_distortion(seed: int) -> None:
 
 def test_a_jump_is_found_where_it_is() -> None:
     """Pixels that are not square, or a shear, had been blamed."""
-    made = faults.scene(6, flat=True)
+    made = faults.scene(3, flat=True)
     given = faults.misfit_network(made, faults.Effects(jumps=0.005), SOUND, np.random.default_rng(1))
     (found,) = adjust_unmodelled(given).explanations
     y_mm, by_um = (float(found.cause.split(a)[1].split(b)[0]) for a, b in ((" y = ", " mm"), ("(", ",")))
@@ -118,7 +101,7 @@ def test_affinities_of_seventy_images_own_are_tried_with_unknowns_of_these() -> 
     assert result.vpv > 2.0 * result.redundancy
 
 
-@parametrize_with_studies("seed", [4, 5, 6, 7])
+@parametrize_with_studies("seed", [3, 5, 6, 7])
 def test_an_estimated_noise_does_not_hide_two_cameras_in_one(seed: int) -> None:
     made = faults.scene(seed, flat=True)
     given = faults.misfit_network(made, faults.Effects(crop=0.5, zoom=0.2), SOUND, np.random.default_rng(seed))
@@ -135,7 +118,7 @@ def test_an_estimated_noise_does_not_hide_two_cameras_in_one(seed: int) -> None:
 FITTED = replace(SOUND, sigma=0.1)  # standard deviations given ten times too small
 
 
-@parametrize_with_studies("seed", [4, 5, 6, 7])
+@parametrize_with_studies("seed", [3, 5, 6, 7])
 @parametrize_with_studies("noise", [1.0, 10.0], quick=(1,))
 def test_each_image_with_a_principal_distance_of_its_own_is_no_two_groups(seed: int, noise: float) -> None:
     made, rng = faults.scene(seed, flat=True), np.random.default_rng(seed)
@@ -152,18 +135,7 @@ def test_each_image_with_a_principal_distance_of_its_own_is_no_two_groups(seed: 
     assert abs(float(percent) - 100.0 * (longest / shortest - 1.0)) < 4.0 * float(sigma)
 
 
-@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.study)])
-def test_an_estimated_noise_of_the_size_of_that_given_does_not_hide_two_principal_distances(seed: int) -> None:
-    """These explain all that was estimated, though it is a tenth of the variance."""
-    given = faults.misfit_network(
-        faults.scene(seed, flat=True), faults.Effects(zoom=0.1), SOUND, np.random.default_rng(seed)
-    )
-    result = adjust_unmodelled(given)
-    assert 0.1 < result.unmodelled_mm["cam"] / faults.SIGMA_MM < 0.6
-    assert [each.kind for each in result.explanations] == ["groups"]
-
-
-@parametrize_with_studies("seed", [4, 6])
+@parametrize_with_studies("seed", [3, 6])
 def test_principal_points_of_the_images_own_are_no_principal_distances(seed: int) -> None:
     """As of errors that are correlated within images."""
     made, rng = faults.scene(seed, flat=True), np.random.default_rng(seed)
@@ -179,13 +151,13 @@ def test_a_small_effect_is_no_fault_of_the_model_where_errors_of_an_image_are_co
     kind = faults.MISFITS["lens: k1 alone"]
     effects = replace(kind.effect(1.5), noise=4.0)
     result = adjust_unmodelled(
-        faults.misfit_network(faults.scene(4, flat=True), effects, kind, np.random.default_rng(4))
+        faults.misfit_network(faults.scene(3, flat=True), effects, kind, np.random.default_rng(4))
     )
     assert result.explanations == ()
 
 
 def test_a_diameter_taken_as_exact_is_noted_where_c_depends_on_it() -> None:
-    kind, made = faults.MISFITS["disks of another diameter"], faults.scene(6, flat=True)
+    kind, made = faults.MISFITS["disks of another diameter"], faults.scene(3, flat=True)
     (note,) = adjust(faults.misfit_network(made, faults.Effects(), kind, None)).notes
     change_mm = float(note.split(" changes by ")[1].split(" ")[0])
     tenth = faults.Effects(disk=-(1.1**2 - 1.0) * (kind.disk_radius or 0.0) ** 2)
@@ -210,13 +182,11 @@ def test_dots_are_noted_where_they_would_change_c_and_the_images_leave_them_open
     assert change_mm == pytest.approx(c_mm[1] - c_mm[0], rel=0.1)
     corners = faults.misfit_network(made, faults.Effects(), replace(kind, disk_radius=0.0), np.random.default_rng(3))
     assert adjust(corners).notes == ()
-    precise = replace(kind, sigma=0.05)
-    assert adjust(faults.misfit_network(made, faults.Effects(), precise, np.random.default_rng(3))).notes == ()
 
 
 @pytest.mark.parametrize("flat", [True, False], ids=["board", "deep field"])
 def test_images_with_numbers_one_off_are_left_out_or_all_is_refused(flat: bool) -> None:
-    made, rng = faults.scene(4, flat), np.random.default_rng(1)
+    made, rng = faults.scene(3, flat), np.random.default_rng(1)
     some = {f"im{i:02d}" for i in np.flatnonzero(made.groups)}
     result = adjust(faults.misfit_network(made, faults.Effects(numbers_off=-2), SOUND, rng))
     assert result.left_out.keys() == some
@@ -344,18 +314,6 @@ def test_a_block_of_points_that_is_raised_is_named_whole_with_its_one_shift() ->
     assert abs(shift - 5.0) < 4.0 * sigma < 1.0
 
 
-@pytest.mark.parametrize("times", [0.5, 2.0])
-def test_a_picture_of_another_size_is_left_out(times: float) -> None:
-    """Good images and points were blamed, and c was 2 to 17 standard deviations off."""
-    given = faults.misfit_network(faults.scene(0, flat=True), faults.Effects(), SOUND, np.random.default_rng(0))
-    rows = np.array([name == "im01" for name in given.observations.image])
-    result = adjust(nets.set_observations(given, xy_mm=given.observations.xy_mm * np.where(rows, times, 1.0)[:, None]))
-    assert list(result.left_out) == ["im01"]
-    assert result.left_out["im01"].startswith("all marks of image im01 contradict the other images")
-    assert (result.explanations, result.suspects) == ((), ())
-    assert abs(result.value("IO.cam.c") - faults.C_MM) < 4.0 * result.sigma("IO.cam.c")
-
-
 @parametrize_with_studies("seed", [0, 1, 2, 3], quick=(3,))
 def test_two_pictures_of_another_print_are_left_out(seed: int) -> None:
     """Each has less than half of the errors: all images had been called distorted, with marks suspect in some."""
@@ -381,7 +339,7 @@ def test_two_pictures_of_another_print_are_left_out(seed: int) -> None:
     assert abs(result.value("IO.cam.c") - faults.C_MM) < 4.0 * result.sigma("IO.cam.c")
 
 
-@parametrize_with_studies(("seed", "times"), [(12, 0.5), (4, 1.05), (6, 2.0), (8, 0.8)], quick=(0, 1))
+@parametrize_with_studies(("seed", "times"), [(12, 0.5), (4, 1.05), (6, 2.0), (8, 0.8)], quick=(1,))
 def test_a_picture_of_another_size_is_left_out_where_the_noise_is_fitted(seed: int, times: float) -> None:
     """A bow of the board had been blamed, or c was 0.2 mm off."""
     kind = replace(FITTED, frame_given=True)
@@ -401,7 +359,7 @@ def test_a_picture_of_another_size_is_left_out_where_the_noise_is_fitted(seed: i
 def test_one_picture_under_two_names_is_named(apart_um: float, is_named: bool) -> None:
     """Independent errors of 1 µm lie 1.4 µm apart."""
     rng = np.random.default_rng(1)
-    given = faults.misfit_network(faults.scene(6, flat=True), faults.Effects(), SOUND, rng)
+    given = faults.misfit_network(faults.scene(3, flat=True), faults.Effects(), SOUND, rng)
     rows, observed = np.array([name == "im02" for name in given.observations.image]), given.observations
     again = observed.only(np.flatnonzero(rows))
     again = replace(again, xy_mm=again.xy_mm + rng.normal(0.0, 1e-3 * apart_um, again.xy_mm.shape))
@@ -419,7 +377,7 @@ def test_one_picture_under_two_names_is_named(apart_um: float, is_named: bool) -
 
 @pytest.mark.parametrize("times", [1000.0, 1e-4])
 def test_standard_deviations_in_another_unit_are_refused(times: float) -> None:
-    given = faults.misfit_network(faults.scene(6, flat=True), faults.Effects(), SOUND, None)
+    given = faults.misfit_network(faults.scene(3, flat=True), faults.Effects(), SOUND, None)
     with pytest.raises(AdjustmentError, match="another unit"):
         adjust(nets.set_observations(given, covariance_mm2=times**2 * given.observations.covariance_mm2))
 
@@ -449,7 +407,7 @@ def test_a_loose_prior_that_is_met_well_does_not_hide_the_standard_deviations_of
     assert "given to the object points are too small everywhere" in result.explanations[0].cause
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@parametrize_with_studies("seed", [0, 2])
 def test_pixels_that_are_not_square_are_no_films_deformed_each_in_its_own_way(seed: int) -> None:
     rng, truth = np.random.default_rng([7, seed]), nets.Truth(distortion={"k3": 2e-8, "p1": 2e-8})
     places = nets.field_points(rng, 25)
@@ -460,7 +418,7 @@ def test_pixels_that_are_not_square_are_no_films_deformed_each_in_its_own_way(se
     assert float(found.cause.split("width is ")[1].split(" ±")[0]) == pytest.approx(1.0 / 1.0001, abs=4e-5)
 
 
-@pytest.mark.parametrize("axis", [0, 2])
+@parametrize_with_studies("axis", [0, 2])
 def test_points_in_another_datum_than_observed_orientations_are_named(axis: int) -> None:
     """Sheared points and too small standard deviations were told, or kappa of every image called suspect."""
     given, turn = faults.blunder_network(1, faults.EXACT), np.radians(0.1) * np.eye(3)[axis]
@@ -475,10 +433,12 @@ def test_points_in_another_datum_than_observed_orientations_are_named(axis: int)
     assert adjust(given).explanations == ()
 
 
-@pytest.mark.parametrize(("heights", "plan"), [("none", "observed"), ("none", "approximate"), ("approximate", "none")])
-@pytest.mark.parametrize("factor", [1000.0, 1.0 / 0.3048])
+@pytest.mark.parametrize(
+    ("heights", "plan", "factor"),
+    [("none", "observed", 1.0 / 0.3048), ("none", "approximate", 1000.0), ("approximate", "none", 1000.0)],
+)
 def test_heights_in_another_unit_are_named_by_stations_or_plan_coordinates(
-    factor: float, heights: str, plan: str
+    heights: str, plan: str, factor: float
 ) -> None:
     """Approximations were silent; with observed stations points were said not to be found, or to be noisy."""
     oriented = {"observed": faults.EXACT, "approximate": faults.APPROXIMATE, "none": None}[plan]
@@ -538,7 +498,7 @@ def test_a_wrong_row_of_observed_orientations_is_named_with_both_values(
     assert float(values[1]) == pytest.approx(unit * _rows_of_images(given)[1][k], rel=0.01)
 
 
-@pytest.mark.parametrize(("change", "words"), [(_moved, "f1: the station"), (_turned, "f1: omega, phi, kappa")])
+@parametrize_with_studies(("change", "words"), [(_moved, "f1: the station"), (_turned, "f1: omega, phi, kappa")])
 def test_a_wrong_row_of_approximate_orientations_is_a_note_with_both_values(
     change: Callable[[list[Array]], None], words: str
 ) -> None:
@@ -557,7 +517,7 @@ def test_a_wrong_row_of_approximate_orientations_is_a_note_with_both_values(
 
 
 def sound(frame_mm: tuple[float, float] = (12.8, 9.6)) -> Network:
-    given = faults.misfit_network(faults.scene(6, flat=True), faults.Effects(), SOUND, np.random.default_rng(1))
+    given = faults.misfit_network(faults.scene(3, flat=True), faults.Effects(), SOUND, np.random.default_rng(1))
     return nets.set_camera(given, frame_mm=frame_mm)
 
 
@@ -587,7 +547,7 @@ def test_a_wrong_height_is_named_where_heights_alone_are_given() -> None:
 def test_a_board_that_is_transparent_shows_from_both_sides() -> None:
     kind = replace(faults.MISFITS["one image mirrored, frame_mm"])
     given = faults.misfit_network(
-        faults.scene(6, flat=True), faults.Effects(mirrored=True), kind, np.random.default_rng(1)
+        faults.scene(3, flat=True), faults.Effects(mirrored=True), kind, np.random.default_rng(1)
     )
     (finding,) = adjust(given).misread
     assert "is mirrored" in finding
@@ -619,17 +579,8 @@ def test_a_principal_point_far_from_where_it_is_given_is_named(given_mm: tuple[f
 
 
 @pytest.mark.study
-def test_a_principal_point_outside_the_picture_is_named() -> None:
-    """The picture is cut from the left part of the sensor's: its size says where it ends."""
-    given = sound()
-    kept = given.observations.only(np.flatnonzero(given.observations.xy_mm[:, 0] < 5.5))
-    sentences, _ = faults.misfit_sentences(nets.set_camera(replace(given, observations=kept), frame_mm=(5.6, 9.6)))
-    assert any("outside the picture (x from 0 to 5.6" in each for each in sentences), sentences
-
-
-@pytest.mark.study
 def test_images_that_point_straight_at_a_board_are_named() -> None:
-    made = faults.scene(6, flat=True)
+    made = faults.scene(3, flat=True)
     count = len(made.rotations)
     stations = np.column_stack([made.stations[:, :2] * 0.1 + 60.0, 330.0 + 20.0 * np.arange(count)])
     straight = replace(made, rotations=np.tile(np.eye(3), (count, 1, 1)), stations=stations)
@@ -691,20 +642,8 @@ def test_a_slip_without_a_minimum_is_named(sigma: float, axes: list[int], signs:
     assert words in warning
 
 
-@pytest.mark.study
-@pytest.mark.parametrize("offset", [60.0, 300.0])
-def test_a_slip_with_a_wrong_minimum_is_named_alike(offset: float) -> None:
-    network, xyz = field()
-    result = adjust_network(set_given(network, {WRONG: xyz[WRONG] + [offset, 0.0, 0.0]}))
-    assert result.converged
-    assert result.warnings[0].startswith(f"Control point {WRONG} is not where it is given")
-    assert place(result.warnings[0]) == pytest.approx(xyz[WRONG], abs=0.5)
-    assert f"control point {WRONG} X" in [suspect.tested.name for suspect in result.suspects]
-    assert {suspect.tested.point for suspect in result.suspects} == {str(WRONG)}
-
-
 @pytest.mark.usefixtures("one_by_one")
-@pytest.mark.parametrize("options", [{"snooping": True}, {"robust": "igg3"}])
+@parametrize_with_studies("options", [{"snooping": True}, {"robust": "igg3"}])
 def test_methods_that_leave_out_begin_without_a_slip(options: dict[str, bool | str]) -> None:
     network, xyz = field()
     result = adjust_network(set_given(network, {WRONG: xyz[WRONG][[1, 0, 2]]}), **options)
@@ -734,18 +673,6 @@ def test_a_point_behind_the_cameras_is_a_slip() -> None:
         adjust_network(spoilt)
     result = adjust_network(spoilt, snooping=True)
     assert [(each.tested.name, each.removed) for each in result.suspects] == [(f"control point {WRONG} Z", True)]
-
-
-@pytest.mark.study
-def test_what_is_wrong_with_all_points_is_no_slip_of_one() -> None:
-    network, xyz = field(3, 20)
-    with pytest.raises(AdjustmentError, match=r"Z of all points is 3\.281 times too large for X and Y: another unit"):
-        adjust_network(set_given(network, {row: each * [1.0, 1.0, 3.2808] for row, each in enumerate(xyz)}))
-    shifted = adjust_network(
-        set_given(network, {row: each + np.array([500, -300, 20]) for row, each in enumerate(xyz)})
-    )
-    assert shifted.coordinate_blunders == {}
-    assert shifted.converged
 
 
 @pytest.mark.study
@@ -827,12 +754,6 @@ def test_targets_of_exchanged_frames_are_named(options: Options) -> None:
         adjust(faults.exchanged(few), options=options)
 
 
-@pytest.mark.parametrize("options", [Options(robust=True), Options(snooping=True)])
-def test_robust_methods_do_not_hide_a_slip_of_the_whole(options: Options) -> None:
-    with pytest.raises(AdjustmentError, match="The points are mirrored"):
-        adjust(faults.change_points(faults.blunder_network(2), lambda xyz: xyz * [1.0, 1.0, -1.0]), options=options)
-
-
 def test_flat_fields_are_mirrored_by_their_stations_alone() -> None:
     """Their residuals are those of the true field: cameras behind it see it so."""
     given = faults.blunder_network(3, np.full(6, np.inf), relief=0.0)
@@ -875,13 +796,6 @@ def test_no_principal_point_of_straight_views_is_claimed_that_images_do_not_tell
         assert is_reported or abs(result.value("IO.cam.y0") - y0_mm) < 4.5 * result.sigma("IO.cam.y0")
         reported += is_reported
     assert reported
-
-
-@pytest.mark.parametrize("seed", [4, 6])
-def test_no_decentering_is_noted_that_neither_images_nor_standard_deviations_suggest(seed: int) -> None:
-    truth = nets.Truth(distortion={"k3": 2e-8})
-    given, _ = nets.simulated(np.random.default_rng(seed), truth, point_sigma=0.05, fiducial_sigma=0.01)
-    assert not any("decentering" in note for note in adjust(given).notes)
 
 
 def test_another_unit_of_the_fiducials_is_noted_with_what_it_does_to_c() -> None:

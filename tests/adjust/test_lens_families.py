@@ -136,7 +136,7 @@ def wide_network(seed: int, lens: Array = WIDE) -> Network:
     return nets.digital_network(wide, rows, {k: v for k, v in numbered(xyz).items() if k in found}, noise_mm)
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@parametrize_with_studies("seed", [0, 2])
 def test_a_rational_distortion_begins_at_zero(seed: int) -> None:
     """Where its numerator and its denominator do the same: the solution is regular, and it is found."""
     network = wide_network(seed)
@@ -245,17 +245,6 @@ def test_gruens_formula_as_published() -> None:
     assert len(found) == 44
     for name, pair in expected.items():
         np.testing.assert_allclose(found[name], np.stack(pair, axis=1), atol=1e-14, err_msg=name)
-
-
-@pytest.mark.parametrize("half_mm", [(B, B), (115.0, 80.0)])
-@pytest.mark.parametrize(
-    ("family", "points"), [("ebner", np.linspace(-1, 1, 3)), ("gruen", np.linspace(-1, 1, 5))]
-)  # fmt: skip
-def test_parameters_on_their_grid_are_orthogonal(family: str, points: Array, half_mm: tuple[float, float]) -> None:
-    xy = grid(points, half_mm)
-    found = columns(family, xy, half_mm)
-    assert are_orthogonal(found)
-    assert largest_cosine(found, orientation(xy)) < 1e-12
 
 
 SIZES = {"legendre(2)": 12, "legendre(3)": 26, "legendre(5)": 66, "fourier(1)": 16, "fourier(2)": 48, "fourier(3)": 96}

@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -11,11 +12,11 @@ from networks import CONVERGENT, UNKNOWN, Setup, Truth, field_points, give_value
 from numpy.typing import NDArray
 from reference_cases import CAUSES, DROPPED, Case, case_approximations, case_network, load
 
-from adjust import Adjustment, AdjustmentError, Prior
+from adjust import Adjustment, AdjustmentError
 from adjust.linear_algebra.factor import BlockFactors, DenseBlocks, Factor
 from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.sparse_factor import Triangle
-from adjust.problem.network import Approximations, Network, Transformation
+from adjust.problem.network import Network, Transformation
 from adjust.problem.problem import number
 from adjust.rank_defect import diagnosis
 from adjust.rank_defect.datum import object_datum
@@ -42,10 +43,15 @@ GIVEN: dict[str, list[tuple[str, Callable[[Network], Network]]]] = {
 DEAR = ("nearly-flat", "swapped")
 
 
+@cache
+def failed(name: str) -> Adjustment:
+    """A network of the catalogue as it is adjusted."""
+    return adjust(*CATALOGUE[name].setup.network(), CATALOGUE[name].options)
+
+
 @pytest.mark.parametrize("name", list(CATALOGUE))
 def test_number_words_and_changes_of_the_network_that_mend_it(name: str) -> None:
-    failure = CATALOGUE[name]
-    result = adjust(*failure.setup.network(), failure.options)
+    failure, result = CATALOGUE[name], failed(name)
     assert result.termination == "singular"
     assert len(result.singular) == len(failure.words)
     for direction, words in zip(result.singular, failure.words, strict=True):
@@ -67,7 +73,7 @@ def test_each_prior_that_is_requested_ends_one_direction(name: str) -> None:
     failure = CATALOGUE[name]
     network, start = failure.setup.network()
     alike = () if name in ("known-relief", "known-flat-vertical") else AXES
-    for direction in adjust(network, start, failure.options).singular:
+    for direction in failed(name).singular:
         if direction.cause.startswith(alike):
             continue
         for words, remedy in next((v for k, v in GIVEN.items() if k in direction.cause), []):
@@ -104,34 +110,6 @@ def test_priors_that_are_dropped_leave_the_directions_that_they_end(kind: Transf
         assert tuple(each.cause.split(":")[0] for each in singular) == words
 
 
-@pytest.mark.parametrize(
-    ("known", "gone"),
-    [
-        (("7.X",), ("shift in X",)),
-        (("7.Y",), ("shift in Y",)),
-        (("7.Z",), ("shift in Z",)),
-        (("0.Z", "1.Z", "2.Z"), ("shift in Z", "turn about X", "turn about Y")),
-        (("0.X", "0.Y", "1.X", "1.Y"), ("shift in X", "shift in Y", "turn about Z", "grow or shrink")),
-    ],
-)
-def test_requested_coordinates_end_their_part_of_the_datum(known: tuple[str, ...], gone: tuple[str, ...]) -> None:
-    """Point 7 lies in the middle: a coordinate of a far point ends a turn or the scale as well as a shift."""
-    network, start = MISHAPS["no-datum"].network()
-    left = [each.cause for each in adjust(fix_stations(network, start, known), start).singular]
-    assert len(left) == 7 - len(gone)
-    assert not [cause for cause in left if any(words in cause for words in gone)]
-
-
-def fix_stations(network: Network, start: Approximations, names: tuple[str, ...]) -> Network:
-    """The network with some coordinates given as they are, with a standard deviation of a centimetre."""
-    points = []
-    for point in network.points:
-        of_point = {axis: Prior(float(start.points[point.id][i]), 0.01) for i, axis in enumerate("XYZ")}
-        x, y, z = (of_point[axis] if f"{point.id}.{axis}" in names else None for axis in "XYZ")
-        points.append(replace(point, X=x or point.X, Y=y or point.Y, Z=z or point.Z))
-    return replace(network, points=tuple(points))
-
-
 def test_a_singular_network_tells_too_what_is_nearly_singular() -> None:
     """Axes parallel within half a degree: c is not quite undetermined, but to mend the rest alone is no use."""
     setup = replace(
@@ -142,7 +120,7 @@ def test_a_singular_network_tells_too_what_is_nearly_singular() -> None:
     assert len(result.singular) == 4
     assert [("Practically singular" in each, DISTANCE[0] in each) for each in result.warnings] == [(True, True)]
     for name in ("known-flat-vertical", "known-flat-two", "unknown-pair"):
-        assert adjust(*CATALOGUE[name].setup.network(), CATALOGUE[name].options).warnings == ()
+        assert failed(name).warnings == ()
 
 
 def factorise(shared: Array, *blocks: BlockFactors) -> Factor:
@@ -277,16 +255,6 @@ def test_coordinates_that_the_program_chooses_are_held_where_they_are_given(heig
     held = [name for name in given if result.sigma(name) == 0.0 and (heights or not name.endswith("Z"))]
     assert len(held) == (7 if heights else 3)  # heights determine the scale
     np.testing.assert_allclose([result.value(name) for name in held], [given[name] for name in held], atol=1e-9)
-
-
-def test_chosen_coordinates_are_held_where_they_are_given() -> None:
-    network, start = simulated(np.random.default_rng(5), point_sigma=np.inf)
-    moved = replace(start, points={name: xyz + 0.3 for name, xyz in start.points.items()})
-    result = adjust(network, moved, CHOICES[2])
-    for name in CHOICES[2].datum_coordinates:
-        point, axis = name.split(".")
-        given = getattr(network.point_by_id[point], axis).value
-        assert (result.value(f"PT.{name}"), result.sigma(f"PT.{name}")) == (given, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -203,18 +203,6 @@ def test_observations_all_worse_than_stated_raise_the_limits_by_the_square_of_th
     assert named(result) == sorted(row_name(network, row) for row in amounts)
 
 
-@pytest.mark.study
-def test_two_rays_of_a_point_cannot_be_distinguished() -> None:
-    network, start = nets.simulated(np.random.default_rng(4), point_sigma=0.0)
-    rows = network.observations
-    of_point = [i for i in range(len(rows)) if rows.point[i] == "4" and rows.kind[i] == "target"]
-    two = nets.drop_rows(nets.free_points(network, {"4"}), of_point[2:])
-    result = adjust(nets.add_errors(two, {of_point[0]: np.array([0.15, 0.15])}), start, Options(snooping=True))
-    rays = {row_name(network, of_point[0]), row_name(network, of_point[1])}
-    assert len(result.suspects) == 1
-    assert {result.suspects[0].tested.name, *result.suspects[0].alike} == rays
-
-
 def test_over_flat_ground_of_known_height_no_principal_distance_is_wrong_by_metres() -> None:
     """Parallel axes: the heights' errors alone pull at c, which no image point says anything about."""
     rng = np.random.default_rng(6)
@@ -309,11 +297,6 @@ def test_the_redescending_weights_are_the_published_ones() -> None:
 GROUPS = ("target", "fiducial", "control", "datum")
 
 
-def checkable_network(seed: int, points: int) -> tuple[Network, Approximations]:
-    rng = np.random.default_rng(seed)
-    return nets.simulated(rng, points=nets.field_points(rng, points), fiducial_sigma=0.01, point_sigma=0.05)
-
-
 def dense_sigmas(network: Network, start: Approximations, result: Adjustment) -> list[float]:
     """Twice the inverse of Helmert's matrix, from the dense matrix I - B N^-1 B' of all whitened rows."""
     problem = number(network, start)
@@ -349,7 +332,7 @@ def dense_sigmas(network: Network, start: Approximations, result: Adjustment) ->
 
 @parametrize_with_studies("points", [8, 20])  # images, then points are eliminated first
 def test_the_sigmas_of_the_factors_are_helmerts(points: int) -> None:
-    network, start = checkable_network(3, points)
+    network, start = checkable(3, points)
     result = adjust(network, start, Options(variance_components=GROUPS))
     assert result.converged
     expected = dense_sigmas(network, start, result)
@@ -369,7 +352,7 @@ def test_a_group_without_redundancy_keeps_its_variance() -> None:
 
 @pytest.mark.study
 def test_a_gross_error_that_is_left_out_does_not_spoil_the_factors() -> None:
-    network, start = checkable_network(5, 15)
+    network, start = checkable(5, 15)
     spoilt = nets.add_errors(network, {9: np.array([0.3, 0.1])})
     clean = adjust(network, start, Options(variance_components=True))
     result = adjust(spoilt, start, Options(variance_components=True, snooping=True))
@@ -579,19 +562,6 @@ def test_known_points_without_extent_tell_no_principal_distance(direction: tuple
 def test_a_lens_without_radial_terms_is_advised_no_denominator() -> None:
     (found,) = adjust(board_network(0, (), images=4)).explanations[:1]
     assert found.remedy == 'Free k1, k2, k3 under [distortion.sigma] of the camera ("free").'
-
-
-def test_coordinates_that_count_from_the_middle_of_the_picture_have_its_corners_about_it() -> None:
-    """They were taken to begin at the first pixel: the lens seemed to be known half as far."""
-    network = board_network(0, EIGHT[:5])
-    zero, moved_mm = Prior(0.0, np.inf), network.observations.xy_mm - FRAME_MM / 2.0 * [1.0, -1.0]
-    centred = nets.set_observations(nets.set_camera(network, x0_mm=zero, y0_mm=zero), xy_mm=moved_mm)
-    frame_mm = (float(FRAME_MM[0]), float(FRAME_MM[1]))
-    one, other = (adjust(each).lens_reach(each.cameras[0], frame_mm) for each in (network, centred))
-    assert one is not None
-    assert other is not None
-    assert other.share == pytest.approx(one.share, rel=1e-6)
-    assert other.frame_mm == ((-6.4, -4.8), (6.4, 4.8))
 
 
 def free_all(network: Network, *names: str) -> Network:

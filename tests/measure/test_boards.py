@@ -71,21 +71,6 @@ def test_a_board_that_a_half_turn_does_not_change_is_taken_as_upright_and_says_s
     assert np.abs(errors).max() < 0.05
 
 
-@parametrize_with_studies(
-    "spec",
-    [
-        specs.CircleGridSpec(6, 5, 30.0, 14.0),
-        specs.CircleGridSpec(9, 7, 16.0, 14.0, asymmetric=True),
-        specs.CircleGridSpec(8, 9, 24.0, 15.0, asymmetric=True, row_spacing_mm=13.9),
-    ],
-)
-def test_circle_grids(spec: specs.CircleGridSpec) -> None:
-    board, errors = measure_picture(spec, draw.circles_dark(spec), draw.board_from_pixel(tilt=5e-5))
-    assert board.reason == ""
-    assert len(errors) == len(spec.places())
-    assert np.abs(errors).max() < 0.06
-
-
 @pytest.mark.parametrize(
     ("spec", "dark"),
     [
@@ -273,18 +258,6 @@ def test_a_part_that_may_be_another_is_refused(large_board: tuple[Array, dict[st
     board = measure_board(draw.make_scan(large_board[0][shown]), LARGE)
     assert not any(mark.status.is_observation for mark in board.marks)
     assert "nothing shows which part it is" in board.reason
-
-
-@parametrize_with_studies("covered_mm", [28.0, 31.0, 34.0], quick=(1,))
-def test_a_covers_edge_is_not_where_squares_end(large_board: tuple[Array, dict[str, Array]], covered_mm: float) -> None:
-    """Two columns are covered as lightly as paper, to beside the third at 48 mm, and two lie outside of the picture."""
-    picture, truth = large_board[0].copy(), large_board[1]
-    col, row = np.indices(picture.T.shape, float)
-    x, _ = draw.mapped(draw.board_from_pixel(8.0, 3e-4), np.stack([col, row], axis=-1).reshape(-1, 2)).T
-    picture[covered_mm > x.reshape(col.shape).T + 96.0] = 38000.0
-    end = int(min(truth[f"r{row}c7"][0] for row in range(LARGE.rows))) - 4
-    board = measure_board(draw.make_scan(picture[:, :end]), LARGE)
-    assert not any(mark.status.is_observation for mark in board.marks)
 
 
 def test_a_board_with_corners_outside_is_refused_in_fitting_words(large_board: tuple[Array, dict[str, Array]]) -> None:
@@ -611,11 +584,6 @@ def test_one_marker_more_is_no_board_of_another_count() -> None:
     assert len(read.corners) == 48
 
 
-def test_charuco_rows_too_few_are_named() -> None:
-    spec = specs.CharucoSpec("4X4_50", 6, 7, 32.0, 24.0)
-    assert "but as with rows = 7" in find_charuco(generated(spec), replace(spec, rows=5)).reason
-
-
 @parametrize_with_studies("first", [5, 0])
 def test_markers_counted_from_below_are_those_of_an_aprilgrid(first: int) -> None:
     """And the other way round: the kind that fits is named, with its own keys."""
@@ -659,18 +627,6 @@ def test_a_charuco_corner_is_held_against_the_markers_next_to_it() -> None:
     assert off_corners(found, spec, read) == {}
     found["c2"] = specs.FoundCorner(truth["c7"], 32 * np.eye(2))
     assert "1.0 squares from the place that the adjacent markers give" in off_corners(found, spec, read)["c2"]
-
-
-@parametrize_with_studies("dictionary", ["5X5_100", "APRILTAG_36h11"], quick=(1,))
-def test_aruco_and_apriltag_corners(dictionary: str) -> None:
-    spec = specs.ArucoSpec(dictionary, 3, 2, 63.0, 21.0, first_marker=7)
-    drawing = cv2.aruco.GridBoard((3, 2), 63.0, 21.0, specs.aruco_dictionary(dictionary), np.arange(7, 13))
-    homography = draw.board_from_pixel(4.0, 1e-4)
-    picture = draw.take_picture(spec, homography, draw.printed(drawing, spec, (231, 147), np.array([0.0, 147.0])))
-    board = measure_board(draw.make_scan(picture), spec)
-    errors = draw.errors_px(board, draw.read_truth(spec, homography))
-    assert len(errors) == 24
-    assert np.sqrt(np.mean(errors**2)) < 0.03
 
 
 @parametrize_with_studies(("turn_deg", "quarter_turns"), [(4.0, 0), (184.0, 2)], quick=(1,))

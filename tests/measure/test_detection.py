@@ -101,17 +101,6 @@ def test_a_sharp_mark_to_one_side_of_its_point_may_be_turned_otherwise_than_the_
     assert sigmas_px[:, 1].max() < 0.6
 
 
-def test_what_answers_at_the_edge_of_a_wide_search_is_placed_within_the_window() -> None:
-    """Between the pixels its place may come to lie farther off than was searched."""
-    wide = MarkShape(cross(0.5, 0.2), "dark")
-    grey, place = textured(4), places(4)[12]
-    grey -= 6000 * brute_picture(wide, np.column_stack([LINEAR, place]), grey.shape[1], grey.shape[0], 0.7)
-    scan = make_scan(grey)
-    for off_px in np.arange(38.0, 42.0, 1.0):
-        predicted = np.column_stack([LINEAR, place + np.array([off_px, 0.3])])
-        detect_faint(scan, MarkPrediction(wide, predicted, 38.2, -1), 0.0, 0.7)
-
-
 def test_a_mark_painted_over_with_one_grey_value_is_not_found() -> None:
     grey, place = textured(0), places(0)[12]
     col, row = np.rint(place).astype(int)

@@ -81,30 +81,6 @@ def test_the_finest_detail_of_an_outline_is_an_edge_and_no_piece_of_an_arc() -> 
     assert finest_detail_mm(blunt) == pytest.approx(0.2)
 
 
-@pytest.mark.study
-def test_a_frame_without_a_mark_free_of_blemish_has_no_settled_pose() -> None:
-    """A part of every ring and cross is gone; the identification dots are all there."""
-    matrix = draw.pixel_from_camera("90")
-    grey = draw.frame_picture(draw.NUMBERED, matrix)
-    for mark in draw.NUMBERED.marks:
-        col, row = np.rint(matrix @ (*mark.xy_mm, 1.0)).astype(int)
-        grey[row + 1 : row + 20, col - 18 : col + 17] = 3000
-    result = draw.measure_grey(grey, draw.NUMBERED)
-    assert {mark.status for mark in result.marks} == {Status.WEAK}
-    assert result.pose is not None
-    assert (result.pose.name, result.pose.decided) == ("90", False)
-    assert "No mark passed all checks" in result.pose.evidence[-1]
-
-
-def test_the_users_pose_is_taken() -> None:
-    matrix = draw.pixel_from_camera("270m")
-    result = draw.measure_grey(draw.frame_picture(draw.ALIKE, matrix), draw.ALIKE, FiducialOptions(pose="270m"))
-    assert result.pose is not None
-    assert (result.pose.name, result.pose.decided, result.pose.evidence) == ("270m", True, ("set in the project.",))
-    draw.assert_right(result, draw.ALIKE, matrix)
-    assert result.problems == ()
-
-
 def test_a_pose_of_the_user_that_the_picture_contradicts_is_reported() -> None:
     matrix = draw.pixel_from_camera("90m")
     result = draw.measure_grey(draw.frame_picture(draw.NUMBERED, matrix), draw.NUMBERED, FiducialOptions(pose="0"))
@@ -155,14 +131,6 @@ def test_dark_marks_and_an_unknown_pitch() -> None:
     result = draw.measure_grey(20000 - draw.frame_picture(draw.NUMBERED, matrix), draw.NUMBERED, pitch=False)
     assert draw.found_pose(result)[0] == "0"
     draw.assert_right(result, draw.NUMBERED, matrix)
-
-
-@pytest.mark.study
-def test_no_frame_is_found_in_a_negative_of_light_marks() -> None:
-    negative = 20000 - draw.frame_picture(draw.NUMBERED, draw.pixel_from_camera("0"))
-    lost = draw.measure_grey(negative, polarised("light"), FiducialOptions(pose="0"))
-    assert {mark.status for mark in lost.marks} == {Status.ABSENT}
-    assert "no negative of what" in lost.problems[0]
 
 
 def test_a_negative_is_named_where_marks_have_a_polarity() -> None:

@@ -113,12 +113,6 @@ def test_three_clicks_find_a_frame_in_any_pose_that_no_search_finds(pose: str) -
     draw.assert_right(result, draw.ALIKE, matrix)
 
 
-@pytest.mark.study
-def test_no_search_finds_a_frame_that_lies_so() -> None:
-    grey = draw.frame_picture(draw.ALIKE, draw.pixel_from_camera("0", FAR_TURN_RAD))
-    assert not any(mark.status.is_observation for mark in draw.measure_grey(grey, draw.ALIKE).marks)
-
-
 def test_clicks_that_contradict_the_set_pose_give_no_observation() -> None:
     """As in a viewer that turns the picture: the names would be those of other marks."""
     matrix = draw.pixel_from_camera("180")

@@ -182,7 +182,7 @@ def test_a_chip_sampled_too_coarsely_is_found_in_pictures_shifted_by_known_parts
     assert np.sqrt(np.mean(np.square(np.divide(errors, sigmas)))) < 1.2
 
 
-GROUND, PRECISION_CONTRAST, SNR = 25000.0, 15000.0, 20.0
+GROUND, PRECISION_CONTRAST = 25000.0, 15000.0
 
 
 def sighted(mark: TrueMark, grey: np.ndarray, rng: np.random.Generator, quantisation_step_dn: float = 0.0) -> MarkFit:

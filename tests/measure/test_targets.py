@@ -75,23 +75,6 @@ def test_all_targets_with_their_names_and_honest_sigmas(sign: float) -> None:
     assert 0.75 < np.sqrt(np.mean(errors)) < 1.25  # three standard deviations of 70 numbers
 
 
-@pytest.mark.study
-def test_a_hidden_target_is_not_taken_for_its_neighbour() -> None:
-    field = Field(2, np.array([20.0, 15.0]), search_px=110.0)
-    hidden = ("t0", "t10", "t24")
-    for name in hidden:
-        field.hide(name)
-    marks = field.measure_picture()
-    for name, place in field.places.items():
-        mark = marks[name]
-        if name in hidden:
-            assert mark.status in (Status.PREDICTED, Status.REJECTED)
-            assert mark.reason
-        else:
-            assert mark.status is Status.MEASURED, mark.reason
-            assert np.hypot(*(center(mark) - place)) < 0.2
-
-
 def test_two_disks_at_one_place_are_refused() -> None:
     field = Field(3, np.zeros(2), count=14)
     place, shape = field.places["t10"], field.predictions[10].pixel_from_disk

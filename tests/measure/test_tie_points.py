@@ -121,11 +121,6 @@ def pairs(*rows: tuple[int, int]) -> np.ndarray:
     return np.array(rows, np.intp).reshape(-1, 2)
 
 
-def test_a_point_that_all_pairs_share_is_a_track() -> None:
-    shared = {(0, 1): pairs((4, 5)), (0, 2): pairs((4, 6)), (1, 2): pairs((5, 6))}
-    assert tracks_of_pairs(shared) == [{0: 4, 1: 5, 2: 6}]
-
-
 def test_a_frame_that_one_pair_alone_shows_is_left_out() -> None:
     shared = {(0, 1): pairs((4, 5)), (0, 2): pairs((4, 6)), (1, 2): pairs((5, 6)), (2, 3): pairs((6, 7))}
     assert tracks_of_pairs(shared) == [{0: 4, 1: 5, 2: 6}]
@@ -169,9 +164,6 @@ def test_scans_of_one_exposed_frame_are_one_sight_of_a_point() -> None:
             assert (1 in candidate.maps) == (col > 600) or abs(col - 600) < 5
 
 
-TREES_PX = 25.0  # from row to row
-
-
 def view_pairs(rng: np.random.Generator, relief: float, count: int = 200) -> tuple[Array, Array]:
     """Places (count, 2) in two frames of 1500 px, flying along the columns: height moves them along the rows of these,
     by relief px, rms, in hills of some 300 px; 0.1 px of noise."""
@@ -182,14 +174,6 @@ def view_pairs(rng: np.random.Generator, relief: float, count: int = 200) -> tup
     turned = np.array([[0.0, -1.01], [0.99, 0.0]])
     second = first @ turned.T + [1600.0, -300.0] + np.outer(height, [1.0, 0.0]) + rng.normal(0.0, 0.1, first.shape)
     return first, second
-
-
-def test_a_tree_of_the_next_row_is_an_outlier() -> None:
-    rng = np.random.default_rng(1)
-    for _ in range(20):
-        first, second = view_pairs(rng, relief=1.0)
-        second[7] += [TREES_PX, 0.0]
-        assert np.flatnonzero(neighbour_outliers(first, second)).tolist() == [7]
 
 
 def test_a_false_point_takes_none_of_its_neighbours_with_it() -> None:
