@@ -6,7 +6,8 @@ places are not changed: film deformation adds a variance to the marks of its fra
 becomes weak.
 
 The pattern of residuals is estimated from all frames, film scatter and affinity from those that are no outliers. Each
-frame is tested by `frame_consistency` against the other frames.
+frame is tested by `frame_consistency` against the other frames: its own misfit is left out of the scatter, where it
+would hide a wrong mark.
 """
 
 from collections import Counter
@@ -49,6 +50,7 @@ _AS_ODD = 0.5  # fraction of the log of the smallest p-value: frames below it ar
 _CLIPPED_AT = 0.25  # upper-tail probability at whose quantile chi-squares are clipped
 _CLIPPED_EFFICIENCY = 0.6  # of a variance from clipped chi-squares, relative to one from the mean of squares
 _SAME_SITE = 1 / 3  # fraction of the least distance of two marks: closer marks of two frames share a site of the scan
+_MANY = 20  # frames of which one is no longer left out of the film scatter that it is tested by
 _AXES = 2
 _BELIEVED_DEGREES = 4.0  # degrees of freedom of the prior of the variance factor: on real film the edges differ by 1.4
 _SIGMAS = "second_method_sigmas"
@@ -236,7 +238,7 @@ def explain(frames: Frames, sites: MisfitPattern, believed_mm: float) -> FramesE
                 place: pattern.expected_marks(place, alike[each.pose] >= _FEWEST_ALIKE)
                 for place, each in frames.items()
             }
-            film, is_more = _film([expected[place] for place in ordinary], believed_mm)
+            film, is_more = _film([expected[place] for place in ordinary], believed_mm, 2)
             films_mm = films_mm | {place: _own_film_mm(expected[place], film) for place in ordinary}
         affinities = _affinities({place: (expected[place], frames[place].pose) for place in ordinary}, film.sigma)
         tests = {}
@@ -244,7 +246,9 @@ def explain(frames: Frames, sites: MisfitPattern, believed_mm: float) -> FramesE
             variance = _weak_mm2(frames[place], expected[place], film.sigma, affinities[place])
             # Weak marks are no evidence on the frame.
             widened = expected[place].widen(np.where(frames[place].weak, variance, 0.0))
-            tests[place] = widened, film, affinities[place]
+            others = [expected[each] for each in ordinary if each != place]
+            by_others = _film(others, believed_mm)[0] if len(ordinary) < _MANY else film
+            tests[place] = widened, by_others, affinities[place]
         p_values = {place: frame_p_value(*test) for place, test in tests.items()}
         least = min(p_values.values(), default=1.0)
         if least * len(frames) >= FALSE_DOUBT:
@@ -288,10 +292,13 @@ def _own_film_mm(marks: FrameMarks, film: Scatter) -> float:
     return float(np.sqrt(known / (SCATTER_DEGREES + marks.redundancy)))
 
 
-def _film(frames: Sequence[FrameMarks], believed_mm: float) -> tuple[Scatter, bool]:
-    """Film scatter from ordinary frames, combined with its prior; and whether it is significantly larger than that."""
+def _film(frames: Sequence[FrameMarks], believed_mm: float, fewest: int = 1) -> tuple[Scatter, bool]:
+    """Film scatter from ordinary frames, combined with its prior; and whether it is significantly larger than that.
+
+    fewest: number of frames below which the prior stands.
+    """
     frames = [each for each in frames if each.redundancy]
-    if len(frames) < 2:
+    if len(frames) < fewest:
         return Scatter(believed_mm, SCATTER_DEGREES), False
     degrees = np.array([each.redundancy for each in frames], dtype=float)
     shown = _clipped_variance(lambda variance: np.array([each.chi_square(variance**0.5) for each in frames]), degrees)

@@ -309,6 +309,18 @@ def test_a_mark_of_four_that_is_wrong_is_named_next_to_ten_frames_and_no_other_i
     assert right >= 2  # in nine of ten of 200 folders
 
 
+@pytest.mark.parametrize("count", [2, 3])
+def test_standard_deviations_cover_a_wrong_mark_in_a_small_folder(count: int) -> None:
+    """The scatter that a frame is tested by comes from the others, so that it does not hide its own wrong mark."""
+    rng, covered = np.random.default_rng(6), 0
+    for _ in range(8):
+        frames, wrong, error_mm = folder(rng, count)
+        mark = check_network(frames).frames[0].marks[wrong]
+        assert mark.covariance is not None
+        covered += bool((np.abs(error_mm) < 3.0 * np.sqrt(np.diag(mark.covariance.px2)) / PX_PER_MM).all())
+    assert covered >= 6  # of 60 folders 56 (two frames) and 50 (three); with the own frame in the scatter 16 and 22
+
+
 def test_film_that_scatters_more_than_expected_is_a_problem_of_all_frames() -> None:
     """Next to two frames that are bent as well, a mark that is 1 mm off does not stand out."""
     rng = np.random.default_rng(4)
