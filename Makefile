@@ -24,7 +24,7 @@ test-all: lint $(DOCS)/ready
 # anew.
 suite: export PYTHONDONTWRITEBYTECODE =
 suite: $(TESTED) $(PLAIN)/ready
-	$(BIN)/python -m pytest -n 2 --dist loadgroup $(if $(MARKED),-m "$(MARKED)")
+	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder $(if $(MARKED),-m "$(MARKED)")
 
 lint: $(TESTED)
 	$(BIN)/ruff check .

@@ -14,6 +14,8 @@ import plain_environment
 import pytest
 from real_data import DATA, REASON
 
+LONGEST = ("test_plain_installation.py", "test_workers.py")
+
 
 def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(cpu_limit)  # beside conftest.py: fixtures of a session are not of this folder
@@ -21,7 +23,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What the tests of a file share is made once: all tests of a file stay with one worker."""
+    """What the tests of a file share is made once: all tests of a file stay with one worker. Few tests that take long
+    begin first, so that no worker is left with them alone at the end."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
     for item in items:
         if item.get_closest_marker("xdist_group") is None:
             item.add_marker(pytest.mark.xdist_group(item.path.name))

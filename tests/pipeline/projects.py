@@ -7,6 +7,8 @@ import random
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -167,10 +169,16 @@ def make_project(network: Network, folder: Path, crs: str = "") -> Path:
     comparator.write_text(f"# comparator coordinates, reseau\n{marks}")
     (folder / "scans").mkdir()
     for image in network.images:
-        empty = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
-        tifffile.imwrite(folder / "scans" / f"{image.name}.tif", empty, compression="deflate")
+        (folder / "scans" / f"{image.name}.tif").write_bytes(empty_scan())
     assert command("adjust", path) in (DONE, LOOK)  # a network may show points beyond its frame
     return path
+
+
+@cache
+def empty_scan() -> bytes:
+    file = BytesIO()
+    tifffile.imwrite(file, np.zeros((SIZE_PX, SIZE_PX), np.uint8), compression="deflate")
+    return file.getvalue()
 
 
 def camera_mm(image: int, truth: Truth = TRUTH) -> Array:

@@ -9,6 +9,7 @@ import tomllib
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -38,7 +39,7 @@ from pipeline.calibration.calibrate_stage import CalibrationResult
 from pipeline.calibration.intrinsics import LensChoice, LensModel, choose_lens
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures
 from pipeline.calibration.project_files import CalibrationOptions, board_options, check_folder, write_project
-from pipeline.files.project_file import AdjustSettings
+from pipeline.files.project_tables import AdjustSettings
 from pipeline.files.target_table import read_targets
 from pipeline.opencv_check.board_corners import BoardPictures, compare_corners, detector_name, find_points
 from pipeline.opencv_check.opencv_calibration import NAMES, Freedom, OpenCvCalibration, OpenCVPoints, calibrate
@@ -72,6 +73,7 @@ def corners_px(number: int) -> Array:
     return np.asarray(places, float).reshape(-1, 2)
 
 
+@cache
 def picture(number: int) -> NDArray[np.uint8]:
     """Grey values by the squares that parts of each pixel show, with noise."""
     rotation, shift = pose(number)

@@ -23,6 +23,7 @@ from pipeline.exchange.saved_cameras import _Calibration, _combine, save_cameras
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.library import MARK_KINDS, CameraSizes, camera_template
 from pipeline.files.object_files import GivenImages
+from pipeline.measuring.learn_stage import prior_tone
 from pipeline.measuring.scan_measurement import misplaced_principal_point
 from pipeline.rendered.scene_file import render_project
 from pipeline.results.adjustment_record import Quantity
@@ -37,7 +38,7 @@ camera = "camera.toml"
 field = {{kind = "natural", unit = "m"}}
 picture = {{background = "plain", pad_mm = {pad_mm}, tones = {{dark_mark = 0.06, border = 0.06}}}}
 film = {{transformation = "affine", dust = 0, scratches = 0, hairs = 0}}
-scan = {{pitch_um = {pitch_um}, margin_mm = 1.5}}
+scan = {{pitch_um = 60.0, margin_mm = 1.5}}
 image = [{{name = "one", position = [0.0, 0.0, 5.0], angles_deg = [0.0, 0.0, 0.0]}}]
 """
 POLARITY = {"notch": "light", "wedge": "dark", "wing": "dark"}
@@ -53,7 +54,7 @@ def rendered_frame(folder: Path, kind: str) -> tuple[CameraFile, dict[str, Array
     drawn = text.replace('polarity = "auto"', f'polarity = "{POLARITY.get(kind, "light")}"')
     (folder / "camera.toml").write_text(drawn)
     pad_mm = 0.0 if MARK_KINDS[kind].edge_mm is not None else 1.6
-    (folder / "scene.toml").write_text(SCENE.format(pad_mm=pad_mm, pitch_um=60.0 if kind == "wing" else 40.0))
+    (folder / "scene.toml").write_text(SCENE.format(pad_mm=pad_mm))
     render_project(folder / "scene.toml", folder / "out", lambda *_: None)
     truth = json.loads((folder / "out" / "truth.json").read_text())["images"]["one"]["fiducials"]
     places = {id: np.array([mark["col_px"], mark["row_px"]]) for id, mark in truth.items()}
@@ -63,7 +64,8 @@ def rendered_frame(folder: Path, kind: str) -> tuple[CameraFile, dict[str, Array
 @pytest.mark.parametrize("kind", [kind for kind in MARK_KINDS if kind != "learned"])
 def test_a_rendered_frame_of_each_kind_is_measured_with_its_template(kind: str, tmp_path: Path) -> None:
     given, places, path = rendered_frame(tmp_path, kind)
-    with open_scan(path) as scan:
+    with open_scan(path) as opened:
+        scan = opened.replace_tone(prior_tone("linear", path))
         frame = measure_fiducials(scan, given.layout(), scan.pitch_um, FiducialOptions(pose="0", writing="none"))
     for mark in frame.marks:
         assert mark.status is Status.MEASURED or kind == "frame-corner", mark  # the ground there is no even edge

@@ -247,12 +247,12 @@ def test_what_holds_no_scan_is_reported(given: str, said: str, tmp_path: Path, r
     )
 
 
-def photograph(path: Path, size: tuple[int, int] = (640, 480), board: tuple[int, int] | None = None) -> Path:
+def photograph(path: Path, size: tuple[int, int] = (400, 300), board: tuple[int, int] | None = None) -> Path:
     """A picture by a digital camera, with its Exif block; of a chessboard of so many inner corners or of nothing."""
     picture = np.full((size[1], size[0]), 200, np.uint8)
     if board is not None:
         squares = np.indices((board[1] + 1, board[0] + 1)).sum(axis=0) % 2
-        cells = np.kron(np.where(squares, 20, 235), np.ones((40, 40))).astype(np.uint8)
+        cells = np.kron(np.where(squares, 20, 235), np.ones((24, 24))).astype(np.uint8)
         cells = np.pad(cells, 30, constant_values=235)
         turn = cv2.getRotationMatrix2D((cells.shape[1] / 2, cells.shape[0] / 2), 12.0, 0.9)
         turn[:, 2] += (size[0] / 2 - cells.shape[1] / 2, size[1] / 2 - cells.shape[0] / 2)
@@ -380,10 +380,10 @@ def scene_of(camera: str) -> str:
 def frame(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The project of one rendered frame of a library camera, which it names."""
     folder = tmp_path_factory.mktemp("library")
-    scene = scene_of(RENDERED).replace("pitch_um = 45.0", "pitch_um = 100.0")
+    scene = scene_of(RENDERED).replace("pitch_um = 45.0", "pitch_um = 125.0")
     (folder / "scene.toml").write_text(scene)
     render_project(folder / "scene.toml", folder)
-    text = f'camera = "library:{RENDERED}"\nscans = ["scans/*.tif"]\n[measure]\npose = "0"\n'
+    text = f'camera = "library:{RENDERED}"\nscans = ["scans/*.tif"]\n[measure]\npose = "0"\ntone = "linear"\n'
     (folder / "project.toml").write_text(text)
     return folder / "project.toml"
 

@@ -52,7 +52,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def make_project(folder: Path, camera: str, scans: str = '"scans/*.tif"', pose: str = "0") -> Project:
     given = fiducial_tables({id: (x + 0.2, y - 0.3) for id, (x, y) in CORNERS.items()}, 'mark = "m"\n')
-    text = f'camera = "camera.toml"\nscans = [{scans}]\npitch_um = 50.0\n[measure]\npose = "{pose}"'
+    text = f'camera = "camera.toml"\nscans = [{scans}]\npitch_um = 50.0\n[measure]\npose = "{pose}"\ntone = "linear"'
     return read_project(write_tables(folder, text, camera=camera + given))
 
 

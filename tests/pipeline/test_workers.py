@@ -13,6 +13,7 @@ from unittest.mock import MagicMock
 
 import pytest
 from in_process import wait_until
+from studies import parametrize_with_studies
 
 from pipeline import InputError, workers
 from pipeline.workers import LocalPool, SubmittedAgain, WorkerKilled, cluster_executor, worker_pool
@@ -42,7 +43,7 @@ def begin(kind: str, told: Path) -> None:
         time.sleep(600.0)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@parametrize_with_studies("kind", KINDS)
 def test_a_worker_ends_with_the_process_that_started_it(kind: str, tmp_path: Path) -> None:
     result = tmp_path / "pid"
     program = f"from pathlib import Path; from test_workers import begin; begin({kind!r}, Path({str(result)!r}))"
@@ -66,10 +67,6 @@ def is_alive(pid: int) -> bool:
     return state != "Z"
 
 
-def square(number: int) -> int:
-    return number * number
-
-
 def killed_times(times: int, folder: Path, number: int) -> int:
     """Ends its process the first times that it is called."""
     marks = len(list(folder.iterdir()))
@@ -79,26 +76,19 @@ def killed_times(times: int, folder: Path, number: int) -> int:
     return number
 
 
-def process() -> int:
-    return os.getpid()
-
-
 def test_a_killed_process_is_replaced_and_its_task_begun_again(tmp_path: Path) -> None:
+    """Killed without a task, and then with one. What a task raises is its own."""
     with worker_pool(2, workers=1) as pool:
-        others = [pool.submit(square, number) for number in range(6)]
-        assert pool.submit(killed_times, 1, tmp_path, 7).result(60) == 7
-        assert [other.result(60) for other in others] == [0, 1, 4, 9, 16, 25]
-        assert list(pool.map(square, range(4))) == [0, 1, 4, 9]
-
-
-def test_a_process_killed_without_a_task_is_replaced_and_what_a_task_raises_is_its_own() -> None:
-    with worker_pool(1, workers=1) as pool:
         with pytest.raises(ValueError, match="invalid literal"):
             pool.submit(int, "a").result(60)
-        first = pool.submit(process).result(60)
+        first = pool.submit(os.getpid).result(60)
         os.kill(first, signal.SIGKILL)
         time.sleep(0.2)
-        assert pool.submit(process).result(60) != first
+        assert pool.submit(os.getpid).result(60) != first
+        others = [pool.submit(abs, -number) for number in range(6)]
+        assert pool.submit(killed_times, 1, tmp_path, 7).result(60) == 7
+        assert [other.result(60) for other in others] == list(range(6))
+        assert list(pool.map(abs, (-1, -2))) == [1, 2]
 
 
 def test_a_script_without_a_guard_starts_the_workers_once(tmp_path: Path) -> None:
@@ -116,16 +106,16 @@ def test_a_script_without_a_guard_starts_the_workers_once(tmp_path: Path) -> Non
 def test_a_task_that_kills_its_process_twice_is_given_up_and_none_else(tmp_path: Path) -> None:
     with worker_pool(2, workers=2) as pool:
         bad = pool.submit(killed_times, 99, tmp_path, 7)
-        others = [pool.submit(square, number) for number in range(6)]
+        others = [pool.submit(abs, -number) for number in range(6)]
         with pytest.raises(WorkerKilled, match="its process was ended, most likely because the memory was full"):
             bad.result(60)
-        assert [other.result(60) for other in others] == [0, 1, 4, 9, 16, 25]
+        assert [other.result(60) for other in others] == list(range(6))
     assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_a_process_killed_on_its_way_says_nothing_of_the_task(tmp_path: Path) -> None:
     with worker_pool(1, workers=1) as pool:
-        killed = {pool.submit(process).result(60)}
+        killed = {pool.submit(os.getpid).result(60)}
         task = pool.submit(killed_times, 1, tmp_path, 7)
         for _ in range(2):
             while not (coming := [child for child in multiprocessing.active_children() if child.pid not in killed]):
