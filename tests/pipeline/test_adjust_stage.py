@@ -276,28 +276,6 @@ def test_interior_orientation_has_the_published_residuals(kind: str, tmp_path: P
     assert result.redundancy == 2 * (16 - {"affine": 6, "similarity": 4}[kind])
 
 
-@needs("film_numbers")
-def test_the_affine_transformation_of_eight_fiducials_is_the_published_one(tmp_path: Path) -> None:
-    """Published with its rms, all errors in the given coordinates: they are given 1 mm, the readings 0.1 µm."""
-    pitch_mm = 0.042
-    with (DATA / "film_numbers" / "sju_8fid" / "fiducials.csv").open(encoding="utf-8") as lines:
-        marks = list(csv.DictReader(lines))
-    places = {m["id"]: (float(m["cal_x_mm"]), float(m["cal_y_mm"])) for m in marks}
-    rows = ["image,point,kind,x_mm,y_mm,sx_mm,sy_mm"]
-    rows += [
-        f"left,{m['id']},fiducial,{pitch_mm * float(m['x_px'])},{-pitch_mm * float(m['y_px'])},1e-4,1e-4" for m in marks
-    ]
-    camera = 'name = "SJU"\n' + projects.fiducial_tables(places, "sigma_mm = 1\n")
-    result = adjust_network(
-        projects.write_tables(tmp_path, 'camera = "camera.toml"', camera=camera, comparator=rows).parent
-    )
-    found = {name: result.value(f"T.left.{name}") for name in ("a1", "a2", "a3", "b1", "b2", "b3")}
-    per_px = [pitch_mm * found["a2"], -pitch_mm * found["a3"], pitch_mm * found["b2"], -pitch_mm * found["b3"]]
-    assert per_px == pytest.approx([0.041989, 0.000144, 0.000147, -0.041985], abs=6e-7)
-    assert (found["a1"], found["b1"]) == pytest.approx((-120.259262, 116.872551), abs=1e-5)  # from single precision
-    assert result.redundancy == 10
-
-
 def test_film_is_added_to_the_covariance_of_every_mark(tmp_path: Path) -> None:
     network, _ = nets.simulated(np.random.default_rng(1))
     path = projects.write_network_project(network, tmp_path)
@@ -429,9 +407,7 @@ def test_points_that_are_no_board_are_reported(tmp_path: Path, refusal: projects
 SCANS = nets.Truth(middle_mm=(120.0, -115.0), mirrored=(False, True, False, False))
 
 
-@parametrize_with_studies(
-    "kind", ["congruent", "projective", "bilinear", "conformal(2)", "polynomial(2)"], quick=(0, 1)
-)
+@parametrize_with_studies("kind", ["congruent", "projective", "bilinear", "conformal(2)", "polynomial(2)"], quick=(1,))
 def test_films_of_every_kind_are_adjusted_from_files(kind: Transformation, tmp_path: Path) -> None:
     points = nets.field_points(np.random.default_rng(7), 16)
     network, _ = nets.simulated(np.random.default_rng(4), SCANS, kind, points)
@@ -682,9 +658,8 @@ def test_points_that_no_image_shows_are_a_note_and_an_unknown_one_in_one_image_i
 def test_names_of_one_image_that_differ_by_case_and_ending_are_named(
     other: str, tmp_path: Path, printed_line: projects.Printed
 ) -> None:
-    project = projects.adjusted_project(tmp_path)
-    projects.replace_text(project, 'scans = ["scans/*.tif"]\n', "")
-    table = tmp_path / "comparator.csv"
+    network, _ = nets.simulated(np.random.default_rng(1), points=nets.field_points(np.random.default_rng(2), 40))
+    project, table = write_network(network, tmp_path), tmp_path / "comparator.csv"
     head, *rows = table.read_text().splitlines()
     own = [row.replace("f1,", f"{other},") for row in rows if row.startswith("f1,")]
     fiducials = [row for row in own if ",fiducial," in row]
