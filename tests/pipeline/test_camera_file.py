@@ -38,7 +38,7 @@ camera = "camera.toml"
 field = {{kind = "natural", unit = "m"}}
 picture = {{background = "plain", pad_mm = {pad_mm}, tones = {{dark_mark = 0.06, border = 0.06}}}}
 film = {{transformation = "affine", dust = 0, scratches = 0, hairs = 0}}
-scan = {{pitch_um = 60.0, margin_mm = 1.5}}
+scan = {{pitch_um = {pitch_um}, margin_mm = 1.5}}
 image = [{{name = "one", position = [0.0, 0.0, 5.0], angles_deg = [0.0, 0.0, 0.0]}}]
 """
 POLARITY = {"notch": "light", "wedge": "dark", "wing": "dark"}
@@ -54,7 +54,7 @@ def rendered_frame(folder: Path, kind: str) -> tuple[CameraFile, dict[str, Array
     drawn = text.replace('polarity = "auto"', f'polarity = "{POLARITY.get(kind, "light")}"')
     (folder / "camera.toml").write_text(drawn)
     pad_mm = 0.0 if MARK_KINDS[kind].edge_mm is not None else 1.6
-    (folder / "scene.toml").write_text(SCENE.format(pad_mm=pad_mm))
+    (folder / "scene.toml").write_text(SCENE.format(pad_mm=pad_mm, pitch_um=60.0 if kind == "wing" else 50.0))
     render_project(folder / "scene.toml", folder / "out", lambda *_: None)
     truth = json.loads((folder / "out" / "truth.json").read_text())["images"]["one"]["fiducials"]
     places = {id: np.array([mark["col_px"], mark["row_px"]]) for id, mark in truth.items()}

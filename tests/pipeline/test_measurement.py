@@ -90,8 +90,8 @@ def test_scans_have_equal_options_unless_targets_are_sought(tmp_path: Path) -> N
         ("project", 'pose = "0"', 'pose = "90"'),
         ("project", 'tone = "linear"', "tone = 2.2"),
         ("project", 'pose = "0"', 'pose = "0"\nwriting = "all"'),
-        ("project", 'pose = "0"\n', 'pose = "0"\n[adjust]\nfilm_sigma_um = 9.0\n'),
-        ("project", 'pose = "0"\n', f'pose = "0"\n{BOARD}'),
+        ("project", 'tone = "linear"\n', 'tone = "linear"\n[adjust]\nfilm_sigma_um = 9.0\n'),
+        ("project", 'tone = "linear"\n', f'tone = "linear"\n{BOARD}'),
     ],
 )
 def test_what_may_change_the_result_changes_the_options(file: str, old: str, new: str, tmp_path: Path) -> None:
