@@ -94,7 +94,7 @@ def _priors(network: Network) -> dict[str, Prior]:
     for camera in network.cameras:
         owner = f"IO.{camera.name}"
         priors |= {f"{owner}.c": camera.principal_distance_mm, f"{owner}.x0": camera.x0_mm, f"{owner}.y0": camera.y0_mm}
-        priors |= {f"{owner}.{name}": Prior(0.0) for name in _LENS[camera.distortion.family]}
+        priors |= {f"{owner}.{name}": Prior(0.0) for name in _LENS}
         priors |= {f"{owner}.{name}": prior for name, prior in camera.distortion.parameters.items()}
         for id_, mark in camera.fiducials.items():
             priors |= {f"FID.{camera.name}.{id_}.x": mark.x_mm, f"FID.{camera.name}.{id_}.y": mark.y_mm}
@@ -154,24 +154,17 @@ def _function(network: Network, x: Values, row: int, xy: Array | Complex, mirror
     return np.asarray(place - np.array([io["x0"], io["y0"]]) + io["c"] * np.array([u / w, v / w]) - d)
 
 
-_LENS = {"torlegard": ("k3", "k5", "k7", "p1", "p2", "p3", "p4"), "brown": ("k1", "k2", "k3", "p1", "p2", "b1", "b2")}
+_LENS = ("k3", "k5", "k7", "p1", "p2", "p3", "p4")
 
 
 def _distortion(network: Network, camera: str, x: Values, r: Complex, place: Complex) -> Complex:
     distortion = network.camera_by_name[camera].distortion
-    q = {name: x[f"IO.{camera}.{name}"] for name in _LENS[distortion.family]}
-    r2 = r[0] ** 2 + r[1] ** 2
-    if distortion.family == "torlegard":
-        z = distortion.r0_mm**2
-        radial = q["k3"] * (r2 - z) + q["k5"] * (r2**2 - z**2) + q["k7"] * (r2**3 - z**3)
-        growth = 1 + q["p3"] * r2 + q["p4"] * r2**2
-        ex, ey = place if distortion.decentering == "paper" else r
-        affinity = 0.0
-    else:
-        radial = q["k1"] * r2 + q["k2"] * r2**2 + q["k3"] * r2**3
-        growth, (ex, ey) = 1.0, r
-        affinity = q["b1"] * r[0] + q["b2"] * r[1]
-    dx = r[0] * radial + (q["p1"] * (r2 + 2 * ex**2) + 2 * q["p2"] * ex * ey) * growth + affinity
+    q = {name: x[f"IO.{camera}.{name}"] for name in _LENS}
+    r2, z = r[0] ** 2 + r[1] ** 2, distortion.r0_mm**2
+    radial = q["k3"] * (r2 - z) + q["k5"] * (r2**2 - z**2) + q["k7"] * (r2**3 - z**3)
+    growth = 1 + q["p3"] * r2 + q["p4"] * r2**2
+    ex, ey = place if distortion.decentering == "paper" else r
+    dx = r[0] * radial + (q["p1"] * (r2 + 2 * ex**2) + 2 * q["p2"] * ex * ey) * growth
     dy = r[1] * radial + (2 * q["p1"] * ex * ey + q["p2"] * (r2 + 2 * ey**2)) * growth
     return np.array([dx, dy])
 

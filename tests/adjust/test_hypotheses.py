@@ -339,7 +339,7 @@ def test_two_pictures_of_another_print_are_left_out(seed: int) -> None:
     assert abs(result.value("IO.cam.c") - faults.C_MM) < 4.0 * result.sigma("IO.cam.c")
 
 
-@parametrize_with_studies(("seed", "times"), [(12, 0.5), (4, 1.05), (6, 2.0), (8, 0.8)], quick=(1,))
+@parametrize_with_studies(("seed", "times"), [(12, 0.5), (4, 1.05), (6, 2.0), (8, 0.8)])
 def test_a_picture_of_another_size_is_left_out_where_the_noise_is_fitted(seed: int, times: float) -> None:
     """A bow of the board had been blamed, or c was 0.2 mm off."""
     kind = replace(FITTED, frame_given=True)
@@ -394,17 +394,6 @@ def test_standard_deviations_of_points_in_m_for_mm_are_named_with_the_factor() -
     )
     assert words
     assert float(words[1]) == pytest.approx(1000.0, rel=0.2)
-
-
-def test_a_loose_prior_that_is_met_well_does_not_hide_the_standard_deviations_of_points() -> None:
-    """60 gross errors had been suspected, since c, x0 and y0 lay nearer to what was given than their sigma of 1 mm."""
-    given = faults.change_points(faults.blunder_network(2), lambda xyz: xyz, 1e-3)
-    truth = nets.Truth()
-    priors = nets.given_interior([truth.c, truth.x0, truth.y0], 5.0)
-    given = nets.set_camera(given, principal_distance_mm=priors[0], x0_mm=priors[1], y0_mm=priors[2])
-    result = adjust(given)
-    assert [each.kind for each in result.explanations] == ["noise"]
-    assert "given to the object points are too small everywhere" in result.explanations[0].cause
 
 
 @parametrize_with_studies("seed", [0, 2])

@@ -84,29 +84,6 @@ def test_a_model_without_redundancy_is_named_without_bounds_of_sigma0() -> None:
 
 
 @pytest.mark.study
-def test_a_scanners_bend_is_chosen_and_not_taken_for_a_richer_film() -> None:
-    """Frames of marks alone, in all four quarters: the terms that bend, beside films that are affine."""
-    bend = {"a20": 0.02, "b11": -0.015}
-    network = nets.bent_films([0.0, 90.0, 180.0, 270.0], bend, {}, np.random.default_rng(1))
-    choice = model_choice.choose(adjust(network, approximate(nets.bent_films([0.0, 90.0, 180.0, 270.0], {}, {}))))
-    assert choice.chosen is not None
-    assert choice.chosen.model == model_choice.Model("affine", bends=(("S", ("a20", "b11")),))
-    assert choice.chosen.sigma0 == pytest.approx(1.0, abs=0.3)
-    assert choice.verdict.startswith("Selected: affine, no distortion, bend of scanner S: a20 b11.")
-    assert any(reason.startswith("affine, no distortion is too simple: ") for reason in choice.reasons)
-
-
-@pytest.mark.study
-def test_a_straight_scanner_gets_no_bend_and_what_is_not_reported_is_stated() -> None:
-    few = {name: nets.EIGHT_MARKS_MM[name] for name in "1234"}
-    network = nets.bent_films([0.0] * 3, {}, {}, np.random.default_rng(2), marks_mm=few)
-    choice = model_choice.choose(adjust(network, approximate(nets.bent_films([0.0] * 3, {}, {}, marks_mm=few))))
-    assert choice.chosen is not None
-    assert choice.chosen.model.bends == ()
-    assert any("all frames lie alike in the scanner" in reason for reason in choice.reasons)
-
-
-@pytest.mark.study
 @pytest.mark.parametrize("film", ["none", "congruent", "similarity", "affine", "projective"])
 @pytest.mark.parametrize("lens", list(LENSES))
 def test_the_true_model_is_chosen_and_no_strong_effect_ever_missed(lens: str, film: Transformation) -> None:

@@ -74,26 +74,6 @@ def board_sample(
     return result.projection_uncertainty("desk", distance, BOARD_MM).covariance_mm2, where, BOARD_MM
 
 
-def film_sample(rng: np.random.Generator, points: Array, distance: float) -> tuple[Array, Array, Array]:
-    """The same over a frame of film; places count in the frame of the true marks, by an affine interior orientation."""
-    truth = nets.Truth()
-    network, start = nets.simulated(rng, truth, points=points, free=dict.fromkeys(truth.distortion, np.inf))
-    result = adjust(network, start)
-    marks = np.array([[result.value(Parameter.fiducial("K", id, axis)) for axis in "xy"] for id in nets.FIDUCIALS])
-    true_marks = np.column_stack([np.array(list(nets.FIDUCIALS.values())), np.ones(len(nets.FIDUCIALS))])
-    film = np.linalg.lstsq(true_marks, marks, rcond=None)[0]
-    stations, attitudes = np.array(truth.stations), [nets.rotation(*each) for each in truth.attitudes]
-    view = zip(stations, attitudes, strict=True)
-    in_camera = np.concatenate([(points - station) @ turn.T for station, turn in view])
-    fitted = np.concatenate([adjusted_image(result, one.name).camera_from_object(points)[0] for one in network.images])
-    level = replace(truth, stations=((0.0, 0.0, 0.0),), attitudes=((0.0, 0.0, 0.0),))
-    fixed = points_along((FILM_MM - [truth.x0, truth.y0]) / truth.c, distance)
-    places = nets.camera_point(level, 0, fixed)
-    where = places_after_alignment(projection(result, "K"), in_camera, fitted, fixed)
-    where = np.linalg.solve(film[:2].T, (where - film[2]).T).T
-    return result.projection_uncertainty("K", distance, places).covariance_mm2, where, places
-
-
 def projection(result: Adjustment, camera: str) -> Projection:
     lens = adjusted_lens(result, camera)
     return lambda points: lens.camera_from_ray(-points[:, :2] / points[:, 2:])[0]
@@ -131,15 +111,6 @@ def test_three_hundred_boards_scatter_as_it_says(distance: float) -> None:
     rng, true = np.random.default_rng(6), true_board(6)
     start = approximate(true.network)
     assert 0.95 < spread([board_sample(rng, true, start, distance) for _ in range(300)]) < 1.05
-
-
-@pytest.mark.study
-@pytest.mark.parametrize("distance", [np.inf, 1500.0])
-def test_three_hundred_films_scatter_as_it_says(distance: float) -> None:
-    """The marks' frame is given to 1 mm, and the standard deviations are some micrometres."""
-    rng = np.random.default_rng(7)
-    points = nets.field_points(rng, 40)
-    assert 0.95 < spread([film_sample(rng, points, distance) for _ in range(300)]) < 1.05
 
 
 def test_the_datum_of_the_marks_has_no_part_in_it() -> None:

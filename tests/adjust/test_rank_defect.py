@@ -257,6 +257,16 @@ def test_coordinates_that_the_program_chooses_are_held_where_they_are_given(heig
     np.testing.assert_allclose([result.value(name) for name in held], [given[name] for name in held], atol=1e-9)
 
 
+def test_chosen_coordinates_are_held_where_they_are_given() -> None:
+    network, start = simulated(np.random.default_rng(5), point_sigma=np.inf)
+    moved = replace(start, points={name: xyz + 0.3 for name, xyz in start.points.items()})
+    result = adjust(network, moved, CHOICES[2])
+    for name in CHOICES[2].datum_coordinates:
+        point, axis = name.split(".")
+        given = getattr(network.point_by_id[point], axis).value
+        assert (result.value(f"PT.{name}"), result.sigma(f"PT.{name}")) == (given, 0.0)
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

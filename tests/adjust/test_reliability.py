@@ -218,21 +218,6 @@ def test_over_flat_ground_of_known_height_no_principal_distance_is_wrong_by_metr
     assert named(result) == []
 
 
-def test_redundancy_is_what_a_residual_shows_of_an_error() -> None:
-    """An error in one coordinate appears in its residual times minus the redundancy number, correlations included."""
-    network, start = nets.simulated(np.random.default_rng(3), noise=False)
-    row = nets.observation_row(network, "target", "f2", "7")
-    covariance = network.observations.covariance_mm2.copy()
-    covariance[row] = 0.004**2 * np.array([[1.0, 0.6], [0.6, 2.0]])
-    for axis in (0, 1):
-        spoilt = nets.add_errors(
-            nets.set_observations(network, covariance_mm2=covariance), {row: 1e-4 * np.eye(2)[axis]}
-        )
-        result = adjust(spoilt, start)
-        shown = -result.residuals.v_mm[row, axis] / 1e-4
-        assert shown == pytest.approx(result.residuals.redundancy[row, axis], rel=1e-4)
-
-
 def test_rms_is_per_axis() -> None:
     """Per point it would be larger by the root of two."""
     network, start = nets.simulated(np.random.default_rng(4))
@@ -348,16 +333,6 @@ def test_a_group_without_redundancy_keeps_its_variance() -> None:
     assert result.variance_sigmas["target"] > 0.0
     few = adjust(network, start, Options(variance_components=("exterior", "tie")))
     assert few.variance_factors == {}
-
-
-@pytest.mark.study
-def test_a_gross_error_that_is_left_out_does_not_spoil_the_factors() -> None:
-    network, start = checkable(5, 15)
-    spoilt = nets.add_errors(network, {9: np.array([0.3, 0.1])})
-    clean = adjust(network, start, Options(variance_components=True))
-    result = adjust(spoilt, start, Options(variance_components=True, snooping=True))
-    assert len(result.suspects) == 1
-    assert result.variance_factors["target"] == pytest.approx(clean.variance_factors["target"], rel=0.1)
 
 
 def adjust_network(truth: nets.DrawnFrames) -> Adjustment:

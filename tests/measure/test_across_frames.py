@@ -9,22 +9,13 @@ import pytest
 from drawn import center, measured_mark
 from studies import parametrize_with_studies
 
-from measure import (
-    Code,
-    FiducialLayout,
-    FrameMeasurement,
-    LayoutMark,
-    MarkShape,
-    Reason,
-    ScanOrientation,
-    Status,
-    cross,
-)
+from measure import Code, FiducialLayout, FrameMeasurement, LayoutMark, MarkShape, Reason, Status, cross
 from measure.fiducials.across_frames import CheckedFrames, check_frames
 from measure.fiducials.consistency import FrameMarks, frame_p_value
 from measure.fiducials.options import BelievedFilm
 from measure.flags import FALSE_DOUBT, Cause
 from measure.geometry import UP_FROM_CAMERA
+from measure.results import ScanOrientation
 
 PX_PER_MM, SIGMA_PX, FILM_MM = 50.0, 0.02, 0.003
 PITCH = (1000 / PX_PER_MM, 1000 / PX_PER_MM)

@@ -414,16 +414,6 @@ def test_trap_pixel_locking() -> None:
         assert np.abs(corner.center_px - center).max() < 0.004
 
 
-def test_a_bent_tone_curve_and_sharpening_do_not_move_a_crossing() -> None:
-    rng = np.random.default_rng(4)
-    for _ in range(4):
-        center, steps = CORNER_SIZE // 2 + rng.uniform(-0.5, 0.5, 2), board_steps(rng)
-        linear = square_picture(center, steps, 0.8, False)
-        bent = 255 * (np.clip(linear - 45, 0, None) / 255) ** 0.45
-        corner = fit_mark(bent, center + rng.normal(0, 0.3, 2), steps, False)
-        assert np.abs(corner.center_px - center).max() < 0.01
-
-
 def test_a_stain_is_left_out() -> None:
     rng = np.random.default_rng(5)
     center, steps = np.array([12.1, 11.8]), np.diag([14.0, 14.0])

@@ -124,14 +124,6 @@ def test_many_marks_are_tested_as_by_a_matrix_of_all_of_them(model: str, monkeyp
     np.testing.assert_allclose(results[0], results[1], rtol=1e-6)
 
 
-def test_of_four_marks_on_one_frame_none_is_called_wrong_where_film_may_be_bent() -> None:
-    """A mark 1 mm off, or film bent by 0.15 mm: either moves all four alike beside an affine transformation."""
-    four = view_marks(SQUARE, UP_FROM_CAMERA["0"])
-    assert outlying(SQUARE, four + 0.15 * np.outer((1.0, -1.0, 1.0, -1.0), (0.6, 0.8))) == []
-    four[1] += (1.0, 0.0)
-    assert outlying(SQUARE, four) == []
-
-
 @pytest.mark.parametrize("order", range(1, HIGHEST_ORDER + 1))
 @pytest.mark.parametrize("name", FILM_NAMES)
 def test_every_film_model_of_the_adjustment_has_its_terms(name: str, order: int) -> None:

@@ -4,20 +4,9 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import drawn as draw
 import numpy as np
 import pytest
-from drawn import (
-    ALIKE,
-    RING_CROSS,
-    center,
-    chi_square,
-    frame_picture,
-    lay_out,
-    make_scan,
-    measure_grey,
-    paint,
-    pixel_from_camera,
-)
 from studies import parametrize_with_studies
 from true_marks import KIND, TrueMark, some_mark
 
@@ -53,13 +42,13 @@ def test_a_faint_mark_gets_the_blur_of_the_others_and_those_need_none() -> None:
 
 def test_a_mark_exposed_twice_may_lie_where_either_exposure_does() -> None:
     """Of four, one that lies twice on the film, 2.1 px apart: its fit is that of the mean of both."""
-    matrix = pixel_from_camera("0")
-    grey, second = frame_picture(ALIKE, matrix), np.column_stack([matrix[:, :2], matrix[:, 2] + (1.7, 1.3)])
-    paint(grey, ALIKE.marks[1].mark, ALIKE.marks[1].xy_mm, second, 9000.0)
-    marks = measure_grey(grey, ALIKE).marks
+    matrix = draw.pixel_from_camera("0")
+    grey, second = draw.frame_picture(draw.ALIKE, matrix), np.column_stack([matrix[:, :2], matrix[:, 2] + (1.7, 1.3)])
+    draw.paint(grey, draw.ALIKE.marks[1].mark, draw.ALIKE.marks[1].xy_mm, second, 9000.0)
+    marks = draw.measure_grey(grey, draw.ALIKE).marks
     smeared = [mark.covariance is not None and Cause.SMEAR in mark.covariance.parts for mark in marks]
     assert smeared == [mark.status is Status.WEAK for mark in marks] == [False, True, False, False]
-    off, claimed = center(marks[1]) - matrix @ (*ALIKE.marks[1].xy_mm, 1.0), marks[1].covariance_px2
+    off, claimed = draw.center(marks[1]) - matrix @ (*draw.ALIKE.marks[1].xy_mm, 1.0), marks[1].covariance_px2
     assert claimed is not None
     assert np.hypot(*off) > 0.9
     assert off @ np.linalg.solve(claimed, off) < 4
@@ -68,18 +57,18 @@ def test_a_mark_exposed_twice_may_lie_where_either_exposure_does() -> None:
 @parametrize_with_studies("apart_px", [0.0, 0.2, 3.0], quick=(1, 2))
 def test_a_mark_whose_ring_lies_apart_from_its_lines_may_lie_where_either_does(apart_px: float) -> None:
     """In all four marks alike, so that no mark differs from the others."""
-    matrix = pixel_from_camera("0")
-    lines, rings = (lay_out([MarkShape(parts)] * 4) for parts in (RING_CROSS[1:], RING_CROSS[:1]))
+    matrix = draw.pixel_from_camera("0")
+    lines, rings = (draw.lay_out([MarkShape(parts)] * 4) for parts in (draw.RING_CROSS[1:], draw.RING_CROSS[:1]))
     shifted = np.column_stack([matrix[:, :2], matrix[:, 2] + apart_px * np.array([0.8, -0.6])])
-    grey = frame_picture(lines, matrix)
+    grey = draw.frame_picture(lines, matrix)
     covers = np.zeros((2, *grey.shape))
     for line, ring in zip(lines.marks, rings.marks, strict=True):
-        paint(covers[0], line.mark, line.xy_mm, matrix, 1.0)
-        paint(covers[1], ring.mark, ring.xy_mm, shifted, 1.0)
+        draw.paint(covers[0], line.mark, line.xy_mm, matrix, 1.0)
+        draw.paint(covers[1], ring.mark, ring.xy_mm, shifted, 1.0)
     grey += 9000 * covers[1] * (1 - covers[0])
-    for mark, given in zip(measure_grey(grey, ALIKE).marks, ALIKE.marks, strict=True):
+    for mark, given in zip(draw.measure_grey(grey, draw.ALIKE).marks, draw.ALIKE.marks, strict=True):
         assert mark.covariance is not None
-        off = center(mark) - matrix @ (*given.xy_mm, 1.0)
+        off = draw.center(mark) - matrix @ (*given.xy_mm, 1.0)
         assert off @ np.linalg.solve(mark.covariance.px2, off) < (4 if apart_px else 16)
         assert mark.status is (Status.WEAK if apart_px > 1 else Status.MEASURED)
         assert ("its lines lie 3.0 px from its ring" in mark.reason) is (apart_px > 1)
@@ -99,7 +88,7 @@ def test_a_faint_mark_claims_what_its_fit_lies_off_unless_that_is_taken(sigma_px
 
     chosen = choose_fit(faint(5.0, 0.06), faint(5.1, sigma_px), None)
     if sigma_px < 0.06:
-        assert center(chosen)[0] == 5.1
+        assert draw.center(chosen)[0] == 5.1
     else:
         np.testing.assert_allclose(chosen.covariance_px2, np.diag([0.06**2 + 0.1**2, 0.06**2]))
 
@@ -112,12 +101,12 @@ def test_a_width_of_lines_that_most_crosses_show_is_taken_and_that_of_few_is_not
 
 
 def test_crosses_whose_lines_are_narrower_than_drawn_are_drawn_so_and_fitted() -> None:
-    shown, given = (lay_out([MarkShape(cross(2.4, mm), "dark")] * 4) for mm in (0.1, 0.12))
-    matrix, size = pixel_from_camera("0"), 400
+    shown, given = (draw.lay_out([MarkShape(cross(2.4, mm), "dark")] * 4) for mm in (0.1, 0.12))
+    matrix, size = draw.pixel_from_camera("0"), 400
     grey = 30000 + np.random.default_rng(3).normal(0, 400.0, (size, size))
     for mark in shown.marks:
-        paint(grey, mark.mark, mark.xy_mm, matrix, -20000.0, 55, 0.1)
-    scan = make_scan(grey)
+        draw.paint(grey, mark.mark, mark.xy_mm, matrix, -20000.0, 55, 0.1)
+    scan = draw.make_scan(grey)
     frame = detect_frame(
         scan.replace_tone(LINEAR), given, Placement("0", matrix, 1.0, 4, 1, 1, (0.05, 0.05)), FiducialOptions("0")
     )
@@ -125,7 +114,7 @@ def test_crosses_whose_lines_are_narrower_than_drawn_are_drawn_so_and_fitted() -
     assert len(drawn_mm) == 1
     assert min(drawn_mm) < 0.11
     for fit, mark in zip(frame.inlier_fits.values(), given.marks, strict=True):
-        assert np.hypot(*(center(fit) - matrix @ (*mark.xy_mm, 1.0))) < 0.05
+        assert np.hypot(*(draw.center(fit) - matrix @ (*mark.xy_mm, 1.0))) < 0.05
 
 
 def test_marks_of_one_blur_are_rarely_doubted_and_another_blur_is() -> None:
@@ -232,9 +221,9 @@ def make_frame(
         contrast = CONTRAST * (share if number in FAINT else 1.0)
         grey[corner[1] :, corner[0] :][: mark.size, : mark.size] += contrast * mark.picture
         marks.append((mark, corner))
-    scan = make_scan(grey)
-    pixel_from_camera = np.column_stack([1.001 * linear, middle + np.array([1.0, -1.0])])
-    placement = Placement("0", pixel_from_camera, 8.0, 8, 1, 1, (1 / PX_PER_MM, 1 / PX_PER_MM))
+    scan = draw.make_scan(grey)
+    placed = np.column_stack([1.001 * linear, middle + np.array([1.0, -1.0])])
+    placement = Placement("0", placed, 8.0, 8, 1, 1, (1 / PX_PER_MM, 1 / PX_PER_MM))
     return measure_frame(scan, FiducialLayout(layout, (50.0, 50.0)), placement, FiducialOptions()), marks
 
 
@@ -343,8 +332,8 @@ def test_wings_of_three_marks_under_wrong_names_claim_no_more_than_the_stretch_t
         mark = replace(some, place=np.column_stack([linear, linear @ place + middle - corner]))
         grey[corner[1] :, corner[0] :][: mark.size, : mark.size] += CONTRAST * mark.picture
         true_px.append(linear @ place + middle)
-    scan = make_scan(grey)
+    scan = draw.make_scan(grey)
     placement = Placement("0", np.column_stack([linear, middle]), 8.0, 3, 1, 1, (1 / PX_PER_MM, 1 / PX_PER_MM))
     frame = measure_frame(scan, FiducialLayout(layout, (50.0, 50.0)), placement, FiducialOptions())
     for fit, place in zip(frame.inlier_fits.values(), true_px, strict=True):
-        assert chi_square(fit, place) < 16.0
+        assert draw.chi_square(fit, place) < 16.0

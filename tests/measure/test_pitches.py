@@ -30,18 +30,9 @@ from measure.results import Covariance, MarkMeasurement, shift_frame
 from measure.scans.metadata import Samples
 from measure.scans.opening import crop_scan
 from measure.tone.curve import LINEAR
+from synthetic_images import scene as scenes
 from synthetic_images.areas import disk
 from synthetic_images.render import render_scene
-from synthetic_images.scene import (
-    DrawnMark,
-    Scene,
-    SceneCamera,
-    SceneFiducial,
-    SceneFilm,
-    SceneImage,
-    SceneScanner,
-    Tones,
-)
 
 # A frame of 14 mm with a hundredth of the usual tolerances bends as little as one of 140 mm.
 STIFF = FiducialOptions(pose="0", misfit_mm=0.03, affinity=1e-4, gate_mm=0.03)
@@ -272,12 +263,14 @@ RADIUS_MM, OBLIQUE_FILM_PITCH_UM, FRAME_MM = 1.5, 200.0, (228.0, 228.0)
 
 
 def test_balls_under_a_perspective_are_found_and_the_perspective_is_named(tmp_path: Path) -> None:
-    ball = DrawnMark((disk((0.0, 0.0), RADIUS_MM),))
-    camera = SceneCamera("film", FRAME_MM, 150.0, fiducials=tuple(SceneFiducial(*one, ball) for one in PLACES.items()))
-    film = SceneFilm("projective", tilt_deg=float(np.degrees(np.arcsin(0.04 * 600.0 / 212.0))), tilt_direction_deg=40.0)
-    scanner = SceneScanner((OBLIQUE_FILM_PITCH_UM, OBLIQUE_FILM_PITCH_UM), margin_mm=6.0, noise=0.01)
-    image = SceneImage("f", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0))
-    scene = Scene("film", 1, camera, hidden_field(), (image,), scanner, film, Tones(contrast=0.0))
+    ball = scenes.DrawnMark((disk((0.0, 0.0), RADIUS_MM),))
+    fiducials = tuple(scenes.SceneFiducial(*one, ball) for one in PLACES.items())
+    camera = scenes.SceneCamera("film", FRAME_MM, 150.0, fiducials=fiducials)
+    tilt_deg = float(np.degrees(np.arcsin(0.04 * 600.0 / 212.0)))
+    film = scenes.SceneFilm("projective", tilt_deg=tilt_deg, tilt_direction_deg=40.0)
+    scanner = scenes.SceneScanner((OBLIQUE_FILM_PITCH_UM, OBLIQUE_FILM_PITCH_UM), margin_mm=6.0, noise=0.01)
+    image = scenes.SceneImage("f", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0))
+    scene = scenes.Scene("film", 1, camera, hidden_field(), (image,), scanner, film, scenes.Tones(contrast=0.0))
     (truth,) = render_scene(scene, tmp_path).frames
     shape = MarkShape((Disk((0.0, 0.0), RADIUS_MM),), "light")
     layout = FiducialLayout(tuple(LayoutMark(k, xy, (0.002, 0.002), shape) for k, xy in PLACES.items()), FRAME_MM)

@@ -95,16 +95,6 @@ def test_jpeg_file_is_read_whatever_its_name(tmp_path: Path) -> None:
     assert np.abs(whole(tmp_path / "s.tif") - smooth).max() < 8
 
 
-def test_trap_16_bit_squeezed_or_wrapped_to_8(tmp_path: Path) -> None:
-    truth = np.full((40, 50), 256, np.uint16)
-    truth[10, 20] = 40001
-    for name in ("s.tif", "s.png"):
-        cv2.imwrite(str(tmp_path / name), truth)
-        with open_scan(tmp_path / name) as scan:
-            assert scan.full_scale_dn == 65535.0
-            np.testing.assert_array_equal(scan.window(0, 0, 50, 40), truth)
-
-
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("options", [{}, {"compression": "lzw", "tile": (64, 64)}])
 def test_white_is_zero_ignored(tmp_path: Path, dtype: type[np.unsignedinteger[Any]], options: dict[str, Any]) -> None:

@@ -291,7 +291,7 @@ def server(tmp_path: Path) -> Iterator[RangeServer]:
         yield server
 
 
-@parametrize_with_studies("layout", LAYOUTS, quick=(2,))
+@parametrize_with_studies("layout", LAYOUTS, quick=(1, 2))
 def test_windows_are_those_of_the_local_file(tmp_path: Path, server: RangeServer, layout: str) -> None:
     picture = noise((3,) if layout == "planes" else ())
     tifffile.imwrite(tmp_path / "s.tif", picture, **LAYOUTS[layout])

@@ -17,7 +17,7 @@ from pipeline.errors import InputError
 from pipeline.rendered.scene_file import parse_scene
 from pipeline.text.toml_tables import Table
 from synthetic_images import scene as scenes
-from synthetic_images.areas import coverage, disk
+from synthetic_images.areas import coverage
 from synthetic_images.background import scene_background
 from synthetic_images.film import frame_geometry
 from synthetic_images.frame import frame_truth
@@ -66,13 +66,6 @@ def test_a_fiducial_lies_where_its_pose_puts_it(tmp_path: Path, pose: str) -> No
         z = complex(-x if pose.endswith("m") else x, y) * np.exp(1j * np.deg2rad(int(pose.rstrip("m"))))
         expected = np.array([174.5 + (z.real + 0.11) / 0.04, 174.5 - (z.imag - 0.07) / 0.04])
         assert np.linalg.norm(position - expected) < 0.0045 * np.hypot(x, y) / 0.04
-
-
-def test_a_symmetric_mark_is_rendered_symmetrically(tmp_path: Path) -> None:
-    camera = replace(CAMERA, fiducials=(scenes.SceneFiducial("o", (0.0, 0.0), CROSS),))
-    picture, _ = rendered(tmp_path, scene(camera=camera, field=hidden_field()))
-    assert np.abs(picture - picture[::-1, ::-1]).max() < 2e-5
-    assert np.abs(picture - picture.T).max() < 2e-5
 
 
 def test_the_pixels_of_a_texture_come_at_no_regular_distance() -> None:
@@ -168,25 +161,6 @@ def test_circle_grids_hold_their_dots(tmp_path: Path, asymmetric: bool, dots: in
     misses = [centroid(picture, p.figure_px, 9) - p.figure_px for p in targets.values() if not p.hidden]
     assert len(misses) == dots
     assert np.abs(misses).max() < CENTER_PX
-
-
-def test_a_disk_is_no_smaller_than_it_should_be(tmp_path: Path) -> None:
-    """Seen upright from 3 m with c = 14 mm, a disk of 0.12 m has pi (0.06 / 3 * 14 / 0.04)^2 px."""
-    camera = replace(CAMERA, distortion=scenes.SceneDistortion(), fiducials=())
-    field = scenes.DiskField((scenes.DiskTarget("1", (0.1, 0.2, 0.0)),), 0.12, surround=0.0)
-    image = scenes.SceneImage("f", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0))
-    tones = scenes.Tones(background=0.2, target=0.8, contrast=0.0)
-    picture, truth = rendered(tmp_path, scene(camera=camera, field=field, images=(image,), tones=tones))
-    col, row = np.rint(truth.frames[0].targets["1"].center_px).astype(int)
-    window = picture[row - 14 : row + 15, col - 14 : col + 15]
-    assert (window - 0.2).sum() / 0.6 == pytest.approx(np.pi * 7.0**2, rel=5e-4)
-
-
-def test_a_polygonised_disk_is_a_disk() -> None:
-    """256 vertices: the outline is nowhere off by more than 1e-4 of the radius."""
-    outline = disk((0.0, 0.0), 1.0)[0]
-    middles = (outline + np.roll(outline, -1, axis=0)) / 2
-    assert 1.0 - np.hypot(*middles.T).min() < 1e-4
 
 
 def test_eccentricity_follows_the_closed_form() -> None:

@@ -1,7 +1,5 @@
 """Files of rendered scans: every way to store one picture holds it, in little memory, the same in every run."""
 
-import subprocess
-import sys
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +9,6 @@ import pytest
 import tifffile
 from small_scene import CAMERA, SCANNER, hidden_field, rendered, scene
 
-import synthetic_images
 from synthetic_images.areas import rounded_rectangle
 from synthetic_images.render import STRIP_PX, render_scene
 from synthetic_images.scene import Compression, DrawnMark, SceneFiducial, SceneFilm, Tones
@@ -45,8 +42,7 @@ def test_the_same_picture(
         assert ("TileWidth" in tags) == (tile_px > 0)
 
 
-@pytest.mark.parametrize("tile_px", [0, 64])
-@pytest.mark.parametrize("colour", [False, True])
+@pytest.mark.parametrize(("tile_px", "colour"), [(0, False), (64, True)])
 def test_jpeg_is_near(tmp_path: Path, tile_px: int, colour: bool) -> None:
     scanner = replace(SCANNER, bit_depth=8, colour=colour, tile_px=tile_px)
     expected, _ = rendered(tmp_path / "a", scene(scanner=scanner))
@@ -150,26 +146,3 @@ def test_a_failed_rendering_leaves_the_earlier_scan(tmp_path: Path) -> None:
         render_scene(scene(seed=9), tmp_path, stop)
     assert (tmp_path / "scans" / "f.tif").read_bytes() == before
     assert sorted(path.name for path in (tmp_path / "scans").iterdir()) == ["f.tif"]
-
-
-@pytest.mark.study
-def test_a_frame_of_real_size_needs_little_memory(tmp_path: Path) -> None:
-    """23 x 23 cm at 20 um, 16 bit, grain, dust, in a process of its own. Linux's getrusage would tell of pytest too."""
-    program = """
-import sys
-from dataclasses import replace
-from pathlib import Path
-from pipeline.rendered.scene_file import read_scene
-from synthetic_images.render import render_scene
-made = read_scene(Path(sys.argv[1])).scene
-made = replace(made, images=made.images[:1], scanner=replace(made.scanner, pitch_um=(20.0, 20.0)))
-render_scene(made, Path(sys.argv[2]))
-status = Path("/proc/self/status").read_text().splitlines()
-print(next(line.split()[1] for line in status if line.startswith("VmHWM")))
-"""
-    aerial = Path(synthetic_images.__file__).parent / "scenes" / "aerial_five.toml"
-    command = [sys.executable, "-c", program, str(aerial), str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    with tifffile.TiffFile(next((tmp_path / "scans").glob("*.tif"))) as file:
-        assert file.pages.first.shape == (12000, 12000)
-    assert int(done.stdout) < 600 * 1024  # KiB
