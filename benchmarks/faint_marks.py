@@ -103,6 +103,7 @@ def case(kind: str, blur_px: float, frames: int, seed: int) -> Row:
         cell = Cell()
         for number in range(frames):
             for mark, found, noise in measured_faint(pool[number % len(pool)], snr, rng):
-                cell.add(mark, found, best_errors(mark, noise, 1 / snr, np.zeros(2)), mark.bound(1 / snr))
+                best = best_errors(mark, noise, 1 / snr, np.zeros(len(mark.kind.unknown)))
+                cell.add(mark, found, best, mark.bound(1 / snr))
         row[f"SNR {snr:g}"] = cell.words()
     return row

@@ -215,7 +215,7 @@ CAMERA_BY_NOISE = _limit(
     "a camera whose marks may be false alarms is not matched there",
 )
 NOISE_LIKE_A_MARK = _limit(
-    0.05, "p-value of the highest correlation in the window for noise of its coarseness", "nothing is matched there"
+    0.05, "expected number of peaks as high in the window for noise of its coarseness", "nothing is matched there"
 )
 TEXTURE_LIKE_A_FAINT_MARK = _limit(  # one in some five hundred places
     1e-4, "p-value of a faint mark's correlation and position for background texture", "the faint mark is rejected"

@@ -198,7 +198,7 @@ def fit_corners(
     half = max(start.half_px for start in starts)
     firsts = [np.round(start.center_px).astype(int) - half for start in starts]
     windows = [read(int(col), int(row), 2 * half + 1) for col, row in firsts]
-    return _CornerFits(windows, starts, surface, quantisation_step_dn, first_block_px).run()
+    return _CornerFits(windows, starts, surface).run(quantisation_step_dn, first_block_px)
 
 
 class _CornerFits(FitModel):
@@ -206,17 +206,9 @@ class _CornerFits(FitModel):
 
     damping = _DAMPING
 
-    def __init__(
-        self,
-        windows: Sequence[ScanWindow],
-        starts: Sequence[CornerStart],
-        surface: Surface,
-        quantisation_step_dn: float,
-        first_block_px: tuple[int, int],
-    ) -> None:
+    def __init__(self, windows: Sequence[ScanWindow], starts: Sequence[CornerStart], surface: Surface) -> None:
         super().__init__(len(starts))
         self.windows, self.surface = windows, surface
-        self.quantisation_step_dn, self.first_block_px = quantisation_step_dn, np.array(first_block_px)
         self.origin = np.array([window.origin_px for window in windows], float)
         self.start = np.array([start.center_px for start in starts], float) - self.origin
         self.reach = np.array([start.reach_px for start in starts], float)
@@ -263,7 +255,7 @@ class _CornerFits(FitModel):
             self.ends[here] = window.ends.ravel()[chosen]
         self.places = np.stack([axis[self.pixels] for axis in (col, row)], axis=1)
 
-    def run(self) -> list[Corner]:
+    def run(self, quantisation_step_dn: float, first_block_px: tuple[int, int]) -> list[Corner]:
         """Adjust by plain, then robust least squares until the corners converge; sets a reason for those that do
         not."""
         self._linearise(self.every, is_first=True)
@@ -278,9 +270,9 @@ class _CornerFits(FitModel):
                 robust = [robust_scale(self.residuals[number, self.weights[number] > 0]) for number in moving]
                 self.scale[moving] = np.maximum(np.maximum(robust, floor), 1e-9)
             gauss_newton(self, moving, tolerance_px, _MAX_ITERATIONS)
-        return self._corners()
+        return self._corners(quantisation_step_dn, first_block_px)
 
-    def _corners(self) -> list[Corner]:
+    def _corners(self, quantisation_step_dn: float, first_block_px: tuple[int, int]) -> list[Corner]:
         """Assemble the corners, with covariances from the autocovariance of the residuals, and junctions."""
         design, residuals = self.design, self.residuals
         area, used = self._area(self.every), self.weights > _UNDAMAGED
@@ -293,11 +285,9 @@ class _CornerFits(FitModel):
         shared_dn2 = self._structure_dn2(self._pictures(area > 0))
         fails = np.array([bool(reason) for reason in self.reasons]) | (used.sum(axis=1) <= self.unknowns)
         losses = np.zeros_like(covariances)
-        if self.quantisation_step_dn:
+        if quantisation_step_dn:
             fitted = self._pictures(self.grey - residuals)
-            losses = covariances_of_rounding(
-                influence, fitted, self.origin - self.first_block_px, self.quantisation_step_dn
-            )
+            losses = covariances_of_rounding(influence, fitted, self.origin - first_block_px, quantisation_step_dn)
         covariances[fails], noise_dn = np.inf, np.where(fails, np.nan, np.sqrt(variances))
         rounding_dn = np.finfo(np.float32).eps * np.abs(self.linear[:, 1])  # for a uniform window without noise
         faint = ~fails & ~(np.abs(self.linear[:, 0]) > 2 * np.maximum(noise_dn, rounding_dn))

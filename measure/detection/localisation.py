@@ -7,10 +7,10 @@ from typing import Self
 
 import numpy as np
 from scipy import fft
-from scipy.special import ndtr
 
 from measure.array_types import Array
 from measure.detection.correlation import WIDE, Surroundings, correlation, highest_about
+from measure.detection.significance import expected_peaks
 from measure.flags import NOISE_LIKE_A_MARK
 from measure.geometry import reduced_px, scan_px
 from measure.marks.rendering import detail_px, extent_px, known_picture, mark_window
@@ -74,7 +74,8 @@ def localise(scan: Scan, expected: MarkPrediction) -> tuple[Array, float] | None
     if searches[0].false_alarms > _SURE:
         searches.append(_PeakSearch(scan, expected, _SOFT_PX))
     best = min(searches, key=lambda search: search.false_alarms)
-    return (best.center_px, best.false_alarms) if best.false_alarms <= NOISE_LIKE_A_MARK else None
+    false_alarms = len(searches) * best.false_alarms
+    return (best.center_px, false_alarms) if false_alarms <= NOISE_LIKE_A_MARK else None
 
 
 def highest_peak(scan: Scan, expected: MarkPrediction) -> tuple[Array, float]:
@@ -113,7 +114,7 @@ class _PeakSearch:
         rows, cols = np.indices(response.shape)
         near = np.hypot(cols + first[0] - reduced[0, 2], rows + first[1] - reduced[1, 2]) <= search_px
         self._best = divmod(int(np.where(near, response, -2.0).argmax()), response.shape[1])
-        self._places = int(near.sum())
+        self._radius_px = search_px
         # A sub-pixel start saves the fit one step.
         top = highest_about(response, np.array([self._best[::-1]]), 0.0)[0][0]
         self.center_px: Array = scan_px(top + first, reduction)
@@ -121,19 +122,23 @@ class _PeakSearch:
 
     @cached_property
     def false_alarms(self) -> float:
-        """Expected number of peaks as high under noise. The variance of the correlation of two autocorrelated series is
-        the sum of the products of their autocorrelations over their number (Bartlett, 1935). That sum equals the sum of
-        squares of their cross-correlation over all offsets."""
-        if self.height <= 0:
-            return float(self._places)
+        """Expected number of peaks as high under noise, which correlates with the template like a Gaussian field. The
+        variance of the correlation of two autocorrelated series is the sum of the products of their autocorrelations
+        over their number (Bartlett, 1935). That sum equals the sum of squares of their cross-correlation over all
+        offsets, whose spectrum gives the covariance of the field's slopes, too."""
         chip = self._pattern
         noise = self._flat - self._flat.mean()
         here = noise[self._best[0] :, self._best[1] :][: chip.shape[0], : chip.shape[1]]
         here -= chip * np.float32((here * chip).sum() / (chip**2).sum())
         shape = [fft.next_fast_len(sum(sides), real=True) for sides in zip(noise.shape, chip.shape, strict=True)]
         power = np.abs(fft.rfft2(noise, s=shape) * fft.rfft2(chip, s=shape)) ** 2
-        answers = float(fft.irfft(power.sum(axis=0), n=shape[1])[0]) / shape[0]  # sum of squares (Parseval)
+        down, across = 2 * np.pi * fft.fftfreq(shape[0])[:, None], 2 * np.pi * fft.rfftfreq(shape[1])
+        sums, by_down = power.sum(axis=0), (power * down).sum(axis=0)
+        moments = np.stack([sums, sums * across**2, by_down * across, (power * down**2).sum(axis=0)])
+        # Sums of squares (Parseval): of the field, and of its slopes.
+        answers, *slopes = fft.irfft(moments, n=shape[1])[:, 0].astype(float) / shape[0]
         energy = max(float((noise**2).sum() * (chip**2).sum()), 1e-12)
         variance = max(answers / energy, 1e-12) / float(self._counts.sum())
-        unlike = max(1 - self.height**2, 1e-12)
-        return float(self._places * ndtr(-self.height / np.sqrt(unlike * variance)))
+        strength = self.height / np.sqrt(max(1 - self.height**2, 1e-12) * variance)
+        covariance = np.array(slopes)[[[0, 1], [1, 2]]] / max(answers, 1e-12)
+        return expected_peaks(strength, covariance, self._radius_px)

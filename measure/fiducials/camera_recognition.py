@@ -71,7 +71,8 @@ def recognise_frame(scan: Scan, layout: FiducialLayout, response: CameraResponse
             reduction=int(np.ceil(times * placement.reduction)),
         )
         if response.expected > MAX_FALSE_CAMERAS:
-            # Whether its most significant peaks are improbable as noise is found ten times as fast as by a fit.
+            # Whether its most significant peaks are improbable as noise is found ten times as fast as by a fit. Each
+            # has a probability of its own: by `chance_of_marks` the weakest would stand for all.
             frame = Frame.from_placement(scan, layout, enlarged, _QUICK_OPTIONS)
             indices = range(len(layout.marks))
             peaks = [localise(scan, frame.prediction(index, frame.first_search_px)) for index in indices]

@@ -2,9 +2,9 @@
 
 Alone, such a mark cannot be distinguished from the many places where noise resembles it. With a certain constellation
 only responses as strong and as close to the predicted place compete. Their expected number follows from the texture
-(Adler, The Geometry of Random Fields, 1981: excursions of a Gaussian field), as does the covariance of the place. The
-strength of the texture relative to the lines depends on the tone curve. Where that is unknown, the mark is searched
-with two curves, and the difference enters the covariance.
+(`measure.detection.significance`), as does the covariance of the place. The strength of the texture relative to the
+lines depends on the tone curve. Where that is unknown, the mark is searched with two curves, and the difference enters
+the covariance.
 """
 
 from dataclasses import dataclass, replace
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from measure.array_types import Array, Mask
 from measure.detection.localisation import MarkPrediction
+from measure.detection.significance import expected_peaks
 from measure.flags import NO_REASON, Cause, Code, Reason
 from measure.marks.rendering import detail_px, extent_px, picture
 from measure.matching.window import FAINT, Coding
@@ -243,7 +244,7 @@ class _Field:
             significance=height / scatter,
         )
         distance_px = max(float(np.hypot(*(center - self.predicted))), _LEAST_DISTANCE_PX)
-        return FaintMark(fit, _expected_maxima(height / scatter, slopes / scatter**2, distance_px))
+        return FaintMark(fit, expected_peaks(height / scatter, slopes / scatter**2, distance_px))
 
     def _rotation_px2(self, response: "_Response", lit: Array) -> Array:
         """(2, 2) covariance of the place by the mark's own rotation and scale, for lines off to one side of its point,
@@ -262,13 +263,6 @@ class _Field:
         whole[self.half : -self.half, self.half : -self.half] = True
         alone = np.abs(signal) < _SELF * signal[row, col]
         return np.asarray(near & whole & alone & (response.norm > _SHOWN * response.norm[row, col]))
-
-
-def _expected_maxima(strength: float, slopes: Array, radius_px: float) -> float:
-    """Expected number of maxima of a Gaussian field in a circle that exceed a strength, in its standard deviations, by
-    the expected Euler characteristic of the excursion set (Adler). slopes (2, 2): covariance of the gradient."""
-    density = np.sqrt(np.linalg.det(slopes)) * (2 * np.pi) ** -1.5 * strength * np.exp(-(strength**2) / 2)
-    return float(np.pi * radius_px**2 * density)
 
 
 class _Response:

@@ -44,7 +44,7 @@ _LEAST_WIDTH, _LONGEST_WIDTH = 0.03, 0.2  # of the same: a smaller change is ign
 _SHORTEST = 0.1  # lower bound of ratios: an arm shorter than this counts as missing
 _CHANGE = 0.3  # fraction of the arm's length, step of the central differences in the design matrix
 _LEAST_GAIN = 0.1  # fraction of the fitted contrast: a smaller gain is replaced by it
-_PART_STEPS, _SETTLED_PX, _APART = 12, 0.01, 13.8  # steps of parts; chi-square of their distance at p = 0.001
+_PART_STEPS, _SETTLED_PX = 12, 0.01  # steps of parts; the last one
 _PARTS_APART_PX = 0.5  # an error that a mark with status measured must not have
 _ARM, _SHAPE, _BLUR = "arm", "shape", "blur"
 
@@ -321,6 +321,8 @@ def measure_parts(
 ) -> tuple[Array, Array] | None:
     """Fit the places of a drawing's lines, and of its rings and disks, separately, by Gauss-Newton steps.
 
+    Contrast and ground are eliminated in each step, and the first decides whether there are more: not by the driver.
+
     Parameters
     ----------
     window, pixel_from_mark : as for `measure_arms`.
@@ -353,7 +355,7 @@ def measure_parts(
         among = variance / gain**2 * inverse[:4, :4].reshape(2, 2, 2, 2)
         between = among[0, :, 0] + among[1, :, 1] - among[0, :, 1] - among[1, :, 0]
         apart = step[0] - step[1]
-        if not number and apart @ np.linalg.solve(between, apart) < _APART:
+        if not number and may_be_noise(apart, between):
             return None
         if np.abs(step).max() < _SETTLED_PX:
             break

@@ -15,10 +15,10 @@ from operator import itemgetter
 from typing import Literal
 
 import numpy as np
-from scipy.special import bdtrc, comb
 
 from measure.array_types import Array
 from measure.detection.correlation import CLOSE, GRAINY, WIDE, Surroundings
+from measure.detection.significance import chance_of_marks, share_of_places
 from measure.fiducials.constellation import NARROW, Placement, distinct_places
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA
 from measure.fiducials.measure_frame import (
@@ -375,12 +375,8 @@ def _share_at_full_resolution(result: SearchResult, frame: Frame, found_px: Mapp
         others += [(index, place) for place in compared if np.hypot(*(marks_px - place).T).min() > apart_px]
     weakest = min(frame.response(index, place, FITTED_PX) for index, place in found_px.items())
     radius_px = REDUCED_PX * frame.placement.reduction
-    return _share(sum(frame.response(index, place, radius_px) >= weakest for index, place in others), len(others))
-
-
-def _share(hits: int, places: int) -> float:
-    """Share by Laplace's rule of succession: no hit among sixty places does not mean a rate of zero."""
-    return (hits + 1) / (places + 2)
+    hits = sum(frame.response(index, place, radius_px) >= weakest for index, place in others)
+    return share_of_places(hits, len(others))
 
 
 def _misfit_px(frame: Frame, found_px: Mapping[int, Array], stretches: Array) -> float:
@@ -403,9 +399,8 @@ def _false_alarms(
 ) -> float:
     """Expected number of false frames, from the shares of places that respond as strongly within tolerance_px.
 
-    Of n marks in the scan k respond, the weakest at least as strongly as a share p of all places. A random frame has as
-    many with a probability of about (n over k) p^k. The number of distinct frames is that of all pairs of places, for
-    two marks far apart, that the bounds of rotation and scale allow.
+    The weakest mark found responds as strongly as a share of all places. The number of distinct frames is that of all
+    pairs of places, for two marks far apart, that the bounds of rotation and scale allow.
     """
     search = result.searches[placement.pitch_mm]
     responses, shares, same_px = search.responses, [], 1
@@ -416,7 +411,7 @@ def _false_alarms(
     counts = np.arange(max(min(3, inside), 1), len(shares) + 1)
     if len(counts) == 0:
         return np.inf
-    likely = comb(inside, counts) * np.sort(shares)[counts - 1] ** counts
+    likely = chance_of_marks(counts, inside, np.sort(shares)[counts - 1])
     # Number of distinct frames: same_px neighbouring places of the reduced scan have the same dilated response.
     extent_mm = float(np.hypot(*np.ptp(search.camera_mm, axis=0)))
     span_px = extent_mm / float(search.pitch.mean()) / responses.reduction
@@ -430,8 +425,8 @@ def _false_alarms(
 def doubt_frame(result: SearchResult, frame: Frame) -> Reason:
     """Test whether a frame may be a false alarm.
 
-    If some marks were not found, by the correlation beside the marks (binomial): two marks fit any similarity, and a
-    frame in doubt needs more that no random place matches. Otherwise by the expected number of false frames.
+    If some marks were not found, by the correlation beside the marks: two marks fit any similarity, and a frame in
+    doubt needs more that no random place matches. Otherwise by the expected number of false frames.
 
     Returns
     -------
@@ -446,7 +441,7 @@ def doubt_frame(result: SearchResult, frame: Frame) -> Reason:
     if len(clear) < inside:
         matches, places = random_matches(frame, clear)
         hits = max(matches.values(), default=places)
-        p_value = float(bdtrc(len(clear) - _FREE - 1, inside - _FREE, _share(hits, places)))
+        p_value = float(chance_of_marks(len(clear) - _FREE, inside - _FREE, share_of_places(hits, places)))
         if p_value <= FRAME_DOUBT_P:
             return NO_REASON
         unmatched = sum(each == 0 for each in matches.values())
