@@ -85,7 +85,8 @@ class Surroundings:
 
 def variation(image: Map, about: Map) -> Map:
     """Sum of squared deviations from the mean under a mask, at every place where the mask lies inside the image."""
-    sums, squares = (np.asarray(cv2.matchTemplate(each, about, cv2.TM_CCORR)) for each in (image, image**2))
+    squares = cv2.matchTemplate(np.square(image), about, cv2.TM_CCORR)
+    sums = cv2.matchTemplate(image, about, cv2.TM_CCORR)
     np.divide(np.square(sums, out=sums), about.sum(), out=sums)
     return np.asarray(np.subtract(squares, sums, out=squares), np.float32)
 
@@ -177,8 +178,8 @@ def local_maxima(response: Map, count: int, least: float, apart_px: int = 3) -> 
     (n, 2) column and row, and (n,) heights, the highest first.
     """
     square = np.ones((2 * apart_px + 1, 2 * apart_px + 1), np.uint8)
-    highest = cv2.dilate(response, square, borderType=cv2.BORDER_REPLICATE)
-    is_top = (response == highest) & (response > least)
+    is_top = response == cv2.dilate(response, square, borderType=cv2.BORDER_REPLICATE)
+    is_top &= response > least
     rows, cols = np.divmod(np.flatnonzero(is_top), is_top.shape[1])  # seven times as quick as nonzero
     plateaus = cv2.connectedComponents(is_top.astype(np.uint8))[1][rows, cols]
     first = np.unique(plateaus, return_index=True)[1]  # one of equal neighbours

@@ -41,15 +41,19 @@ _SAMPLED = slice(None, None, 3)  # subsampling for that estimate, since neighbou
 _MOST_CACHED = 768 << 20  # bytes, enough for four different marks in a large scan
 _SMALL_MAPS = 32  # maps of a small scan at full resolution
 _LEAST_CACHED = 32 << 20  # bytes
+_ROUNDING = 1e-9  # of the elements of a turn by a quarter
+_AT_ONCE = 1000  # places whose neighbourhoods are held in memory at a time
 
 
 @dataclass(frozen=True)
 class SearchEffort:
     """Effort of a search. cache_bytes: largest size of the cache; half_px: largest half size of the template of a
-    cross, px of the reduced scan, since the centre suffices where one arm is far longer."""
+    cross, px of the reduced scan, since the centre suffices where one arm is far longer; every_pose: also orientations
+    in which the marks look the same."""
 
     cache_bytes: int = _MOST_CACHED
     half_px: int = 1000
+    every_pose: bool = True
 
     def make_cache(self, scan: Scan) -> "ByteCache":
         """Create the cache shared by all searches of a scan; limited for small scans."""
@@ -136,7 +140,9 @@ class Templates:
 def _search_reduction(scan: Scan, views: Sequence[MarkView]) -> int:
     """Reduction factor of the search: as large as needed, limited so that marks and lines remain visible."""
     limits = []
-    for view in views:
+    # Mirroring changes no extent.
+    distinct = {(view.mark, np.abs(view.linear).tobytes()): view for view in views}
+    for view in distinct.values():
         least, greatest = extent_px(view.mark, np.column_stack([view.linear, np.zeros(2)]))
         thinnest_px = linear_scale(view.linear) * view.mark.thinnest_mm
         limits.append(min((greatest - least).max() / _EXTENT_PX, thinnest_px / _THINNEST_PX))
@@ -157,7 +163,7 @@ def _images(views: Sequence[MarkView], reduction: int, half_px: int) -> list[Arr
         linear, image = first[view.mark]
         turn = view.linear @ np.linalg.inv(linear)
         whole = np.rint(turn)
-        is_quarter = np.allclose(turn, whole, atol=1e-9) and np.array_equal(np.abs(whole).sum(axis=0), [1, 1])
+        is_quarter = np.abs(turn - whole).max() < _ROUNDING and (np.abs(whole).sum(axis=0) == 1).all()
         drawn[key] = turn_by_quarters(image, turn) if is_quarter else _image(view, reduction, half_px)
     return [drawn[view.mark, view.linear.tobytes()] for view in views]
 
@@ -203,8 +209,9 @@ class CorrelationMaps(Mapping[Key, Map]):
         self._own = object()  # identifies these maps in the cache; self would create a reference cycle
 
     def __getitem__(self, key: Key) -> Map:
-        both = self._cache.get((self._own, key[0]), partial(self._both_signs, key[0]))
-        return np.asarray(both[self._signs.index(key[1])])
+        kind, sign = key
+        extremes = self._cache.get((self._own, kind), partial(self._extremes, kind))
+        return np.asarray(extremes[0] if sign > 0 else -extremes[-1])
 
     def __iter__(self) -> Iterator[Key]:
         return ((kind, sign) for kind in range(len(self._templates.images)) for sign in self._signs)
@@ -212,12 +219,12 @@ class CorrelationMaps(Mapping[Key, Map]):
     def __len__(self) -> int:
         return len(self._templates.images) * len(self._signs)
 
-    def _both_signs(self, kind: int) -> Map:
-        """(signs, rows, columns) maps of a kind."""
+    def _extremes(self, kind: int) -> Map:
+        """(1 or 2, rows, columns) largest and least correlation of a kind over all channels; of one channel both are
+        the same."""
         image, detail, get = self._templates.images[kind], self._templates.details_px[kind], self._cache.get
         margin = self._templates.half_px - len(image) // 2
-        signed = np.array(self._signs, np.float32)[:, None, None]
-        maps = None
+        extremes = None
         for number, channel in enumerate(self._channels):
             # Kinds of equal detail share the flattened image, kinds with equal masks its variation under them.
             key = self._own, number, detail
@@ -226,10 +233,13 @@ class CorrelationMaps(Mapping[Key, Map]):
             varied = get((key, mask.tobytes()), partial(variation, flat, mask))
             response = correlation(flat, chip, mask, varied)
             rows, cols = (slice(margin, side - margin) for side in response.shape)
-            own = signed * response[rows, cols]
-            maps = own if maps is None else np.maximum(maps, own, out=maps)
-        assert maps is not None
-        return maps
+            own = response[rows, cols]
+            if extremes is None:
+                extremes = own[None]
+            else:
+                extremes = np.stack([np.maximum(extremes[0], own), np.minimum(extremes[-1], own)])
+        assert extremes is not None
+        return extremes
 
 
 class Dilation:
@@ -250,7 +260,7 @@ class Dilation:
 
     def share(self, place: Array) -> float:
         """Fraction of all places whose response is at least that of a place (2,) of the reduced scan."""
-        return float(np.mean(self.map >= self.height(place)))
+        return np.count_nonzero(self.map >= self.height(place)) / self.map.size
 
     def height(self, place: Array) -> float:
         """Highest response within the radius of a place (2,) of the reduced scan."""
@@ -258,10 +268,10 @@ class Dilation:
         return float(self.map[row, col])
 
     def strength(self, places: NDArray[np.int_]) -> tuple[Array, Mask]:
-        """(n,) squared responses in excess of the background at places (n, 2) of the reduced scan, and mask of those
+        """(...) squared responses in excess of the background at places (..., 2) of the reduced scan, and mask of those
         inside the map; 0 for others."""
         rows, cols = self.map.shape
-        col, row = (places - self.origin).T
+        col, row = np.moveaxis(places - self.origin, -1, 0)
         inside = (col >= 0) & (row >= 0) & (col < cols) & (row < rows)
         response = np.where(inside, self.map[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)], 0.0).astype(float)
         return np.maximum(np.maximum(response, 0.0) ** 2 - self.background**2, 0.0), inside
@@ -316,8 +326,10 @@ class Responses:
     def highest_about(self, key: Key, places: Array, radius_px: float) -> tuple[Array, Array]:
         """Places (n, 2) of the highest responses around places (n, 2) of the reduced scan, and (n,) heights; 0 outside
         the map."""
-        tops, heights = highest_about(self.maps[key], places - self.origin(key), radius_px)
-        return tops + self.origin(key), heights
+        origin, own = self.origin(key), self.maps[key]
+        parts = np.array_split(places - origin, len(places) // _AT_ONCE + 1)
+        tops, heights = zip(*(highest_about(own, part, radius_px) for part in parts), strict=True)
+        return np.concatenate(tops) + origin, np.concatenate(heights)
 
 
 def correlate_scan(

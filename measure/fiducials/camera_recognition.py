@@ -24,7 +24,7 @@ from measure.matching.models import MatchOptions
 from measure.scans.scan import Scan
 
 _COMPARED = 3  # best places: the one with the fewest false alarms is among them
-_QUICK = SearchEffort(cache_bytes=20 << 20, half_px=16)
+_QUICK = SearchEffort(cache_bytes=40 << 20, half_px=16, every_pose=False)
 _AT_LEAST = 3  # marks of a frame that must be detected
 _PLACES = 2  # best places that are tried
 _QUICK_OPTIONS = FiducialOptions(match=MatchOptions(damage_rounds=1))  # likeness needs less accuracy than the place

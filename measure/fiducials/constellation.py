@@ -199,8 +199,11 @@ class PlacementSearch:
         pitch_mm: tuple[float, float],
         bounds: Bounds,
         lens: TakingLens | None = None,
+        every_pose: bool = True,
     ) -> None:
+        """every_pose: False to leave out orientations with equal marks at the places of an earlier one."""
         self.marks, self.responses, self.bounds, self.lens = marks, responses, bounds, lens
+        self._every_pose = every_pose
         self.camera_mm = places_mm(marks)
         self.pitch_mm, self.pitch = pitch_mm, np.asarray(pitch_mm)
         self.steps_mm = lattice_steps_mm(self.camera_mm, bounds.misfit_mm)
@@ -217,7 +220,8 @@ class PlacementSearch:
             for mm in (_SAME * misfit_mm, misfit_mm)
         )
         if same:
-            self.placements[pose] = [placement.reorient(pose, self.camera_mm) for placement in self.placements[same[0]]]
+            known = self.placements[same[0]] if self._every_pose else ()
+            self.placements[pose] = [placement.reorient(pose, self.camera_mm) for placement in known]
         else:
             self.placements[pose] = self.find_placements(pose, kinds)
         self.kinds[pose] = kinds
@@ -253,6 +257,9 @@ class _Constellation:
     def __init__(self, search: PlacementSearch, pose: str, keys: Sequence[Key]) -> None:
         self.search, self.pose, self.keys, self.responses = search, pose, keys, search.responses
         self.camera: Complex = np.asarray(search.camera_mm @ UP_FROM_CAMERA[pose].T @ (1.0, 1.0j), complex)
+        self.marks_by_key: dict[Key, list[int]] = {}
+        for mark, key in enumerate(keys):
+            self.marks_by_key.setdefault(key, []).append(mark)
 
     def placements(self, polarity: int) -> list[Placement]:
         """Score the hypotheses, and refine the best ones."""
@@ -300,7 +307,7 @@ class _Constellation:
     def _hypotheses(self) -> tuple[Complex, Complex]:
         """All similarities within bounds through two marks and two of their candidates."""
         bounds = self.search.bounds
-        candidates = {key: self._complex(self.responses.candidates(key)) for key in dict.fromkeys(self.keys)}
+        candidates = {key: self._complex(self.responses.candidates(key)) for key in self.marks_by_key}
         scales, offsets = [np.zeros(0, complex)], [np.zeros(0, complex)]  # of a layout with one mark there are none
         upright = np.cos(bounds.rotation_rad)
         # Of pairs of distant marks; an even selection if there are too many.
@@ -322,10 +329,9 @@ class _Constellation:
     def _scores(self, radius_px: float, scale: Complex, offset: Complex) -> tuple[Array, Array]:
         """Scores of many placements, and numbers of their marks that respond within the radius."""
         nearest = np.rint(self._reduced_px(scale, offset)).astype(int)
-        answers = [
-            self.responses.dilated(key, radius_px).strength(nearest[:, mark]) for mark, key in enumerate(self.keys)
-        ]
-        strength, inside = (np.stack(each, axis=1) for each in zip(*answers, strict=True))
+        strength, inside = np.empty(nearest.shape[:2]), np.empty(nearest.shape[:2], bool)
+        for key, marks in self.marks_by_key.items():
+            strength[:, marks], inside[:, marks] = self.responses.dilated(key, radius_px).strength(nearest[:, marks])
         score = strength.sum(axis=1) - _OUTSIDE_COST * (~inside).sum(axis=1)
         return score, (strength > 0).sum(axis=1)
 
@@ -336,11 +342,11 @@ class _Constellation:
         moving = np.ones(len(scale), dtype=bool)
         for tolerance_px in (widest, _narrow_tolerance_px(widest)):
             predicted = self._reduced_px(scale, offset)
-            found = [
-                self.responses.highest_about(key, predicted[:, mark], tolerance_px)
-                for mark, key in enumerate(self.keys)
-            ]
-            tops, heights = (np.stack(each, axis=1) for each in zip(*found, strict=True))
+            tops, heights = np.empty(predicted.shape), np.empty(predicted.shape[:2])
+            for key, marks in self.marks_by_key.items():
+                own = predicted[:, marks]
+                found = self.responses.highest_about(key, own.reshape(-1, 2), tolerance_px)
+                tops[:, marks], heights[:, marks] = found[0].reshape(own.shape), found[1].reshape(own.shape[:2])
             weight = np.maximum(heights - _LEAST_WEIGHED, 0.0)
             moving &= (weight > 0).sum(axis=1) >= 2
             scale[moving], offset[moving] = fit_similarity(self.camera, self._complex(tops[moving]), weight[moving])

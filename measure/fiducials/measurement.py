@@ -130,8 +130,7 @@ def _search_frame(
         if pose.name != own and frame.unblemished:
             against = _against_the_set_pose(own, decide_scan_orientation(frame, lines or (), (own, pose.name)))
         pose = ScanOrientation(options.pose, True, _SET)
-    # A faint frame is not tested again: it was accepted only if significant.
-    doubt = NO_REASON if is_faint else doubt_frame(result, frame)
+    doubt = found.doubt if is_faint or frame is found.frame else doubt_frame(result, frame)
     problems = [each.reword(f"{each}.") for each in (*_rivals(result, frame), doubt, against) if each]
     doubts = problems if frame.unblemished else [_UNSURE, *problems]
     if doubts and options.pose == "auto":

@@ -214,7 +214,12 @@ class FrameSearch:
         rotation_rad = float(np.deg2rad(options.rotation_deg))
         searches = {
             each.mm: PlacementSearch(
-                marks, responses, each.mm, Bounds(each.tolerance, rotation_rad, misfit_mm), options.lens
+                marks,
+                responses,
+                each.mm,
+                Bounds(each.tolerance, rotation_rad, misfit_mm),
+                options.lens,
+                self._effort.every_pose,
             )
             for each in hypotheses
         }

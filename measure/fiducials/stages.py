@@ -11,6 +11,7 @@ mark found: all places of the reduced scan, or places beside the marks at full r
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from operator import itemgetter
 from typing import Literal
 
@@ -121,8 +122,7 @@ class Stage:
             return frame is not None and frame.inside_count - len(frame.inlier_fits) < max(
                 _LEAST_GAINED, _MISSED_SHARE * frame.inside_count
             )
-        is_found = frame is not None and (frame.is_faint or not doubt_frame(found.result, frame))
-        return self.kind == "pitch" and is_found
+        return self.kind == "pitch" and found.is_taken and not found.doubt
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +145,11 @@ class StageResult:
     unsure: tuple[Frame, ...] = ()
     faint: Evaluated | None = None
     misfit: Reason = _NOTHING
+
+    @cached_property
+    def doubt(self) -> Reason:
+        """Why the frame may be a false alarm. A faint one is not tested again: it was accepted only if significant."""
+        return NO_REASON if self.frame is None or self.frame.is_faint else doubt_frame(self.result, self.frame)
 
 
 def list_stages(

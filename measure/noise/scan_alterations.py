@@ -192,7 +192,7 @@ def _are_regular(jumps: list[Array], least_px: int = _LEAST_DISTANCE_PX, block_p
         for distance in np.arange(least, least + 1, least / most) if pairs[least] else ():
             blocks = distance / block_px
             on_grid = blocks > 0 and abs(blocks - round(blocks)) < distance / most
-            if not on_grid and min(_regular_jump(each, distance) for each in jumps) > _SIGNIFICANT:
+            if not on_grid and all(_regular_jump(each, distance) > _SIGNIFICANT for each in jumps):
                 return True
     return False
 

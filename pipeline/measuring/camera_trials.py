@@ -19,6 +19,7 @@ from measure.flags import MAX_FALSE_CAMERAS
 from measure.geometry import linear_scale
 from measure.marks.shapes import FiducialLayout, LayoutMark, finest_detail_mm, limit_to_frame
 from measure.scans.opening import open_scan, thumbnail
+from measure.scans.parallel import one_opencv_thread
 from measure.scans.scan import Scan
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.camera_identification import (
@@ -170,6 +171,7 @@ def _stretched_layout(layout: FiducialLayout) -> FiducialLayout:
     return replace(layout, marks=marks)
 
 
+@one_opencv_thread()  # a second one takes 45 MiB
 def identify(
     path: Path,
     cameras: Mapping[str, CameraFile],
@@ -192,6 +194,7 @@ def identify(
     with open_scan(path, max_pixels) as whole:
         picture = thumbnail(whole, _PICTURE_PX)
         times, its_pitch_um = whole.width_px / picture.width_px, whole.pitch_um
+    del whole  # frees the decoded picture
     given, search = its_pitch_um if pitch_um is None else (pitch_um, pitch_um), LayoutSearch(picture)
     layouts = {names: _limit_drawings(cameras[names[0]].layout()) for names in _alike(cameras)}
     pitch = None if given is None else (times * given[0], times * given[1])

@@ -17,6 +17,7 @@ from small_scene import hidden_field
 from studies import parametrize_with_studies
 
 from measure import FiducialOptions, FrameMeasurement, Scan, Status, measure_fiducials, open_scan
+from measure.detection.responses import SearchEffort
 from measure.fiducials.channel_weights import best_weights, registered_channels
 from measure.fiducials.options import CLICK_SIGMA_PX, Click
 from measure.fiducials.scan_checks import pitch_problem, second_frame
@@ -437,3 +438,16 @@ def test_windows_find_the_frame_of_the_scan(center: tuple[float, float], monkeyp
     assert found.pose == whole.pose
     assert found.same_place(whole)
     assert np.hypot(*(found.pixel_from_camera - matrix)[:, 2]) < 3.0
+
+
+def test_orientations_that_look_the_same_are_searched_once_for_a_camera() -> None:
+    scan = draw.make_scan(draw.frame_picture(draw.ALIKE, draw.pixel_from_camera("0")))
+    pitch_mm, options = (draw.PITCH_UM / 1000, draw.PITCH_UM / 1000), FiducialOptions()
+    hypothesis = [PitchHypothesis(pitch_mm, 0.02, pitch_mm)]
+    efforts = SearchEffort(), SearchEffort(every_pose=False)
+    every, once = (
+        FrameSearch(scan, draw.ALIKE, options, effort).search_room(options, hypothesis).placements for effort in efforts
+    )
+    assert {placement.pose for placement in every} == set(POSES)
+    assert {placement.pose for placement in once} == {"0"}
+    np.testing.assert_array_equal(once[0].pixel_from_camera, every[0].pixel_from_camera)

@@ -644,3 +644,17 @@ def test_notches_that_much_of_the_reduced_scan_resembles_are_no_false_alarm() ->
         frame = measure_fiducials(scan, layout, None, FiducialOptions(pose="180"))
     assert sum(mark.status.is_observation for mark in frame.marks) == 4
     assert not any(Code.CHANCE in problem.codes for problem in frame.problems)
+
+
+def test_one_thread_of_opencv_identifies_a_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second one takes memory for windows and networks of its own, and saves no CPU time."""
+    threads, path = list[int](), tmp_path / "grey.png"
+    cv2.imwrite(str(path), np.full((40, 40), 99, np.uint8))
+    monkeypatch.setattr("pipeline.measuring.camera_trials._alike", lambda _: threads.append(cv2.getNumThreads()) or [])
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    try:
+        identify(path, {}, None, Reporter())
+        assert (threads, cv2.getNumThreads()) == ([1], 2)
+    finally:
+        cv2.setNumThreads(before)
