@@ -384,7 +384,8 @@ TIP_MM = ((0.0, 0.0), (0.8, -1.0), (0.8, 1.0))  # of a wedge, whose sides lean o
 @pytest.mark.study
 def test_the_tone_of_a_scanner_stays_when_scans_come_and_go(tmp_path: Path, capsys: projects.Capture) -> None:
     folder = tmp_path / "p"
-    projects.write_project(folder, ["a", "b"], layout=lay_out([MarkShape(polygon(TIP_MM))] * 4))
+    unknown = projects.PROJECT.replace('tone = "linear"\n', "")
+    projects.write_project(folder, ["a", "b"], unknown, lay_out([MarkShape(polygon(TIP_MM))] * 4))
     mark = f'[mark.m]\nkind = "polygon"\nvertices_mm = {[*map(list, TIP_MM)]}\n'
     (folder / "camera.toml").write_text(projects.CAMERA.split("[mark.m]")[0] + mark)
     measure(folder)
