@@ -33,7 +33,7 @@ from measure.scans.opening import ScanHead, read_head
 from pipeline import read_project, stages
 from pipeline.archive.scan_groups import Catalogue, Sample, ScanGroup, catalogue, identify_sample, name_cameras
 from pipeline.files import library
-from pipeline.files.camera_file import read_camera
+from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.library import library_names, library_path, read_library
 from pipeline.measuring.camera_identification import Identification, Trial, drawn_alike
 from pipeline.measuring.camera_trials import _alike, identify
@@ -650,7 +650,12 @@ def test_one_thread_of_opencv_identifies_a_camera(tmp_path: Path, monkeypatch: p
     """A second one takes memory for windows and networks of its own, and saves no CPU time."""
     threads, path = list[int](), tmp_path / "grey.png"
     cv2.imwrite(str(path), np.full((40, 40), 99, np.uint8))
-    monkeypatch.setattr("pipeline.measuring.camera_trials._alike", lambda _: threads.append(cv2.getNumThreads()) or [])
+
+    def no_layouts(_: Mapping[str, CameraFile]) -> list[tuple[str, ...]]:
+        threads.append(cv2.getNumThreads())
+        return []
+
+    monkeypatch.setattr("pipeline.measuring.camera_trials._alike", no_layouts)
     before = cv2.getNumThreads()
     cv2.setNumThreads(2)
     try:
