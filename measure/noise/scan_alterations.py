@@ -22,7 +22,7 @@ import numpy as np
 from scipy import fft
 from scipy.ndimage import maximum_filter1d, median_filter
 
-from measure.array_types import Array, Single
+from measure.array_types import Array, Mask, Single
 from measure.flags import NO_REASON, Cause, Code, Reason
 from measure.scans.scan import Scan
 
@@ -32,7 +32,7 @@ _FEWEST_STEPS = 4
 _MOSTLY = 0.75  # fraction of the distances between rows that are alike
 _AROUND = 25  # rows whose median is what the picture's own slanted lines make
 _CLOSELY_AROUND = 15  # the same for roughness, whose periods are shorter
-_MOST_ROUGH = 5.0  # times the usual difference of rows: marks of alike sizes on plain film have more
+_MOST_ROUGH = 3.0  # times the usual difference of rows: lines and edges of marks, which are regular, have more
 _MOST_SIGMAS = 6.0  # jumps are limited to as many: single ones may be anything
 _OUTLYING, _MOST_OUTLYING = 3.0, 100  # standard deviations of rows whose distances are tried, and their largest number
 _DISTANCES = 8  # that are tried, those between most of these rows
@@ -41,6 +41,7 @@ _BLOCK_PX = 8  # of JPEG, whose grid rows and columns show as well
 _FEW_BLOCKS = 5  # at fewer, thirds of blocks show, too
 _PERIODS, _ALL_NEAR = 16384, 7  # frequencies of the roughness that are sampled, and how many of them a line is wide
 _LOWEST, _OFF_GRID = 0.05, 0.0022  # per pixel: least frequency of a line, and least distance from those of the grid
+_LEAKS = 2.5  # over the number of rows: distance up to which a line leaks under the window
 _STANDS_OUT = 120.0  # times the median power; film that is not interpolated reaches 80
 _BEYOND_GRID = 10.0  # times the line of blocks that one of half their size has at least; of blocks: 2.6
 _LINE, _LINE_AROUND = 4.0, 11  # logarithm of a line of a screen over the median around; other scans: 2.0
@@ -169,16 +170,15 @@ def _jumps(rows: Single) -> Array:
 
 
 def _roughness(rows: Single, order: int, around: int = _AROUND, most: float = np.inf) -> Array:
-    """(n - order,) logarithm of the mean difference of an order between rows, in standard deviations."""
-    size = np.abs(np.diff(rows, order, axis=0))
-    limit = most * np.median(size.mean(axis=1)) if most < np.inf else np.inf
-    size = np.minimum(size, limit).mean(axis=1, dtype=float)
-    return _standardised(np.log(np.maximum(size, 1e-3)), around)
+    """(n - order,) logarithm of the mean difference of an order between rows, in standard deviations; 0 where the
+    difference is beyond so many times the usual one."""
+    size = np.abs(np.diff(rows, order, axis=0)).mean(axis=1, dtype=float)
+    return _standardised(np.log(np.maximum(size, 1e-3)), around, size > most * max(np.median(size), 1e-3))
 
 
-def _standardised(rows: Array, around: int = _AROUND) -> Array:
-    """(n,) values of rows less the median around, in limited standard deviations."""
-    beyond = rows - median_filter(rows, around)
+def _standardised(rows: Array, around: int = _AROUND, left_out: Mask | bool = False) -> Array:
+    """(n,) values of rows less the median around, in limited standard deviations; 0 for those left out."""
+    beyond = np.where(left_out, 0.0, rows - median_filter(rows, around))
     scaled = beyond / max(float(beyond.std()), np.finfo(float).tiny)
     return np.asarray(np.clip(scaled, -_MOST_SIGMAS, _MOST_SIGMAS))
 
@@ -217,7 +217,8 @@ def _is_interpolated(strips: tuple[Single, Single]) -> bool:
     """Whether the roughness of rows and columns has a common period, other than those of a grid of blocks."""
     frequency = fft.rfftfreq(_PERIODS)
     lines = np.array([_lines(each) for each in strips])
-    off_grid = np.abs(frequency * _BLOCK_PX - np.rint(frequency * _BLOCK_PX)) / _BLOCK_PX > _OFF_GRID
+    near = max(_OFF_GRID, _LEAKS / min(map(len, strips)))
+    off_grid = np.abs(frequency * _BLOCK_PX - np.rint(frequency * _BLOCK_PX)) / _BLOCK_PX > near
     own = lines.min(axis=0)[off_grid & (frequency > _LOWEST)].max()
     # A grid of blocks has a line at its own frequency, too.
     eighth, fourth = lines[:, [_PERIODS // 8, _PERIODS // 4]].T

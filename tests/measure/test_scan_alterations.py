@@ -125,6 +125,22 @@ def test_nothing_else_is_taken_for_an_altered_scan() -> None:
         assert not causes(each)
 
 
+@pytest.mark.parametrize("quality", [90, 94])
+def test_the_blocks_of_a_small_compressed_scan_are_no_enlargement(quality: int) -> None:
+    """Of 460 rows the line of the blocks reaches far beside its frequency."""
+    grain = gaussian_filter(np.random.default_rng(quality).normal(size=(460, 460)), 0.7)
+    assert not causes(jpeg(100 + 2 * grain / grain.std(), quality))
+
+
+def test_the_lines_of_a_reseau_are_no_enlargement() -> None:
+    """A réseau's lines make every sixty-second row rough, and those of its harmonics."""
+    side, step_px = 2000, 62.5
+    across = np.abs((np.arange(side) + 20.3) % step_px - step_px / 2)
+    lines = np.clip(2.0 - across, 0.0, 1.0)
+    picture = 180.0 - 36.0 * np.maximum.outer(lines, lines)
+    assert not causes(picture + np.random.default_rng(8).normal(0.0, 1.5, picture.shape))
+
+
 def test_marks_of_a_scan_turned_with_nearest_neighbours_may_be_half_a_pixel_off() -> None:
     matrix, turn = pixel_from_camera("0"), np.radians(1.0)
     result = measure_grey(nearest(frame_picture(ALIKE, matrix), 1.0), ALIKE)
