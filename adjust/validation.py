@@ -17,6 +17,7 @@ LEAST_SIGMA, LARGEST_SIGMA = (
     1e-7,
     0.02,
 )  # standard deviation of most marks, relative to half the extent of an image's marks
+LARGEST_SPREAD = 20.0  # extent of an image's marks over the longer side of the frame
 DEFINITE = 1e-13  # smallest eigenvalue of an earlier calibration's correlation matrix
 
 Faults = Iterator[str]  # sentences; the first one is raised
@@ -26,6 +27,7 @@ def validate(network: Network) -> None:
     """Raise AdjustmentError where a network is empty, contradictory or lacks what an image needs."""
     validate_plan(network)
     _raise_first(_place_faults(network))
+    _raise_first(_extent_faults(network))
     _raise_first(_sigma_faults(network))
 
 
@@ -257,6 +259,19 @@ def _place_faults(network: Network) -> Faults:
             yield (
                 f"image {observations.image[order[start]]}: all its {count} {kind} are at one place, ({x:g}, {y:g}) "
                 "mm. Correct them, or leave the image out."
+            )
+
+
+def _extent_faults(network: Network) -> Faults:
+    """Marks that spread over a multiple of their frame: another unit."""
+    for camera in network.cameras:
+        extents = [network.extent_by_image[each.name].half_mm for each in network.images if each.camera == camera.name]
+        spread_mm = 2.0 * float(np.median(extents)) if extents else 0.0
+        if spread_mm > LARGEST_SPREAD * max(camera.frame_mm) > 0.0:
+            width, height = camera.frame_mm
+            yield (
+                f"The marks of camera {camera.name} spread over {spread_mm:.4g} mm in an image, but its frame_mm is "
+                f"[{width:g}, {height:g}]: one of them is in another unit. Give both in mm; pixels as col_px, row_px."
             )
 
 

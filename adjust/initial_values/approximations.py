@@ -218,16 +218,21 @@ def _why_no_distance(fields: Sequence[KnownField]) -> str:
             f"none shows {FEWEST} points whose X, Y and Z are known. Give an approximate principal_distance_mm, or the "
             "coordinates of more points."
         )
-    xyz = np.concatenate([field.xyz for field in fields])
-    extents = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
-    if extents[1] <= ON_A_LINE * extents[0]:
-        where = "on one line" if extents[0] > 0.0 else "at one place"
+    if where := _on_a_line(np.concatenate([field.xyz for field in fields])):
         return f"all known points that they show lie {where}. Correct their coordinates."
     return (
         "they see too few known points, or look straight at a flat field, where a longer principal distance is a "
         "larger distance from the field. Take images tilted by 20 to 40 degrees in different directions, or give "
         "principal_distance_mm with its standard deviation (0 fixes it)."
     )
+
+
+def _on_a_line(xyz: Array) -> str:
+    """Whether points (n, 3) lie on one line or at one place, in words; "" if neither."""
+    extents = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
+    if extents[1] > ON_A_LINE * extents[0]:
+        return ""
+    return "on one line" if extents[0] > 0.0 else "at one place"
 
 
 def _known_fields(camera: Camera, frames: Frames, principal_point_mm: Array) -> dict[str, KnownField]:
@@ -373,10 +378,14 @@ def _why_not_oriented(block: BlockState, image: str) -> str:
         return f"image {image} sees {len(xyz)} known points; resection needs 3, and 4 to be unique. Either {remedy}"
     if len(xyz) == 3:
         return f"image {image} sees 3 known points, which leave several orientations or none. Either {remedy}"
+    if where := _on_a_line(xyz):
+        return (
+            f"image {image} sees {len(xyz)} known points, and all lie {where}. Correct their coordinates, or {remedy}"
+        )
     which = " (four points do not tell which of them is wrong)" if len(xyz) == 4 else ""
     return (
-        f"image {image} sees {len(xyz)} known points, but no orientation brings them where they were measured, or they "
-        f"lie on one line. Check the point numbers and coordinates{which}, the principal distance and the sign of y, "
+        f"image {image} sees {len(xyz)} known points, but no orientation brings them where they were measured. "
+        f"Check the point numbers and coordinates{which}, the principal distance and the sign of y, "
         f"or {remedy}"
     )
 

@@ -1,4 +1,4 @@
-"""Checks of a measured scan: its pitch against the marks, a second frame beside the first, damage of its file."""
+"""Checks of a measured scan: its pitch against the marks, other frames beside the first, damage of its file."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,6 +20,7 @@ _LEAST_MARKS = 3  # with two, a false one yields a wrong pitch
 _ROOM = 0.9  # fraction of the frame's sides: a free margin narrower than this holds no second frame
 _MOST_MARKS = 0.75  # fraction of the layout's marks that must be measured in a second frame
 _FEWEST_MARKS = 3
+Window = tuple[int, int, int, int]  # first column and row, width, height
 _REACH_PX = 20.0  # around a mark of unknown size: that of a disk or crossing of a test field, with its background
 
 
@@ -64,44 +65,73 @@ def pitch_problem(
     )
 
 
-def second_frame(scan: Scan, layout: FiducialLayout, frame: FrameMeasurement, options: FiducialOptions) -> Reason:
-    """Search the rest of the scan for a second frame.
+def other_frames(scan: Scan, layout: FiducialLayout, frame: FrameMeasurement, options: FiducialOptions) -> Reason:
+    """Search the rest of the scan for other frames.
 
     Returns
     -------
     Reason
-        States the windows that name both frames in images.csv; empty if there is no room for a whole second frame, or
+        States the windows that name all frames in images.csv; empty if there is no room for a whole second frame, or
         none is found.
     """
     named = any(Code.OTHER_FRAME in problem.codes for problem in frame.problems)
     if frame.pixel_from_camera is None or frame.px_per_mm is None or options.part or named:
         return NO_REASON
-    first = _outline(frame, layout)
-    width, height = first[2:] - first[:2]
-    col0, row0, col1, row1 = (int(value) for value in first)
-    rests = (
-        (0, 0, col0, scan.height_px),
-        (col1, 0, scan.width_px - col1, scan.height_px),
-        (0, 0, scan.width_px, row0),
-        (0, row1, scan.width_px, scan.height_px - row1),
-    )
+    outlines, empty, measured = [_outline(frame, layout)], list[Window](), 0
+    width, height = outlines[0][2:] - outlines[0][:2]
+    rests = _rests([(0, 0, scan.width_px, scan.height_px)], outlines[0])
     pitch_um = 1000.0 / frame.px_per_mm
     alone = replace(options, clicks=(), writing="none", known_lines=())
-    for rest in rests:
-        if rest[2] < _ROOM * width or rest[3] < _ROOM * height:
+    while rests:
+        rest = rests.pop(0)
+        is_known = any(_is_within(rest, each) for each in empty)
+        if is_known or rest[2] < _ROOM * width or rest[3] < _ROOM * height:
             continue
         lens = None if options.lens is None else options.lens.crop(*rest[:2])
         found = measure_fiducials(crop_scan(scan, rest), layout, (pitch_um, pitch_um), replace(alone, lens=lens))
-        measured = sum(mark.status is Status.MEASURED for mark in found.marks)
-        if measured >= max(_FEWEST_MARKS, _MOST_MARKS * len(layout.marks)) and found.pixel_from_camera is not None:
-            second = _outline(found, layout) + np.array(rest[:2] * 2)
-            windows = f"{_words(scan, first)} and {_words(scan, second)}"
-            return Reason(
-                f"The scan shows a second frame, {measured} marks of it found, and only one was measured. List both in "
-                f"images.csv, with the scan's name and a suffix, and give the column window: {windows}.",
-                Code.SECOND_PICTURE,
-            )
-    return NO_REASON
+        count = sum(mark.status is Status.MEASURED for mark in found.marks)
+        if count >= max(_FEWEST_MARKS, _MOST_MARKS * len(layout.marks)) and found.pixel_from_camera is not None:
+            measured += count
+            outlines.append(_outline(found, layout) + np.array(rest[:2] * 2))
+            rests = _rests([rest, *rests], outlines[-1])
+        else:
+            empty.append(rest)
+    if not measured:
+        return NO_REASON
+    *windows, last = (_words(scan, each) for each in outlines)
+    shows, all_of_them = ("a second frame", "both") if len(outlines) == 2 else (f"{len(outlines)} frames", "all")
+    return Reason(
+        f"The scan shows {shows}, {measured} marks of others than the first found, and only one was "
+        f"measured. List {all_of_them} in images.csv, with the scan's name and a suffix, and give the column window: "
+        f"{', '.join(windows)} and {last}.",
+        Code.SECOND_PICTURE,
+    )
+
+
+def _rests(areas: Sequence[Window], outline: Array) -> list[Window]:
+    """What an outline leaves of areas: the largest rectangles beside it."""
+    col0, row0, col1, row1 = (int(value) for value in outline)
+    rests = dict.fromkeys(areas, False)
+    for area in areas:
+        col, row, width, height = area
+        left, upper, right, lower = max(col0, col), max(row0, row), min(col1, col + width), min(row1, row + height)
+        if left >= right or upper >= lower:
+            rests[area] = True
+            continue
+        sides = (
+            (col, row, left - col, height),
+            (right, row, col + width - right, height),
+            (col, row, width, upper - row),
+            (col, lower, width, row + height - lower),
+        )
+        rests |= {each: each[2] > 0 and each[3] > 0 for each in sides}
+    return [area for area, is_free in rests.items() if is_free]
+
+
+def _is_within(window: Window, other: Window) -> bool:
+    (col, row, width, height), (col0, row0, other_width, other_height) = window, other
+    across = col0 <= col and col + width <= col0 + other_width
+    return across and row0 <= row and row + height <= row0 + other_height
 
 
 def _outline(frame: FrameMeasurement, layout: FiducialLayout) -> Array:

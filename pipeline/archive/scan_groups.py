@@ -257,8 +257,10 @@ def catalogue(given: Sequence[Path], count: Count, max_pixels: int | None = None
         members[path.parent if by_folder else Path(), own].append((path, head))
     copies = dict[Path, Path]()
     if by_folder:
-        # The original has the shortest name, since copies are called `Copy of 0001` or `0001 (1)`.
-        by_name = sorted((path for path in files if path not in unread), key=lambda path: len(path.name))
+        # The original is no link, and has the shortest name: copies are called `Copy of 0001` or `0001 (1)`.
+        by_name = sorted(
+            (path for path in files if path not in unread), key=lambda path: (path.is_symlink(), len(path.name))
+        )
         for original, *others in alike_groups(by_name, lambda path: path.stat().st_size, parts_hash, content_hash):
             copies |= dict.fromkeys(others, original)
     groups = (

@@ -13,7 +13,7 @@ import numpy as np
 from measure.annotations.text import MISSING, networks
 from measure.errors import MeasurementError, MissingError, TooLargeError, UnreachableError
 from measure.fiducials.measurement import measure_fiducials
-from measure.fiducials.scan_checks import pitch_problem, report_damage, second_frame
+from measure.fiducials.scan_checks import other_frames, pitch_problem, report_damage
 from measure.flags import Code, Reason, Status
 from measure.marks.rendering import extent_px
 from measure.results import FrameMeasurement, MarkMeasurement, shift_frame
@@ -191,7 +191,7 @@ def _fiducials(options: ScanOptions, scan: Scan) -> FrameMeasurement:
             "needs it, for its size says nothing of the pitch."
         )
     measured = measure_fiducials(scan, layout, pitch, options.fiducials)
-    problems: list[Reason | None] = [second_frame(scan, layout, measured, options.fiducials)]
+    problems: list[Reason | None] = [other_frames(scan, layout, measured, options.fiducials)]
     if pitch is not None:
         source = "the project" if options.pitch_um is not None else "the scan's file"
         problems.append(pitch_problem(measured, layout, pitch, source))

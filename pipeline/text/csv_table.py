@@ -55,7 +55,7 @@ class Row:
         if not value:
             return None
         try:
-            number = float(value)
+            number = float(value.replace("_", " ").replace("\N{MINUS SIGN}", "-"))  # float() reads 1_5 as 15
         except ValueError:
             raise self.error(
                 column, f"must be a number with a decimal point or blank, not {files.quote_value(value)}."

@@ -446,3 +446,20 @@ def test_a_principal_distance_that_is_a_guess_is_found_from_the_images(sigma: fl
         result = adjust(guessed, options=Options(iteration_limit=7))
         assert result.converged == converges
         assert any("repeated with approximations" in remark for remark in result.remarks) == converges
+
+
+@pytest.mark.parametrize(("along", "where"), [(1.0, "on one line"), (0.0, "at one place")])
+def test_known_points_on_a_line_or_at_one_place_are_named(along: float, where: str) -> None:
+    """With an approximate principal distance, so that nothing else has to be found first."""
+    truth = nets.project_field(nets.relief_field(300.0), nets.CONVERGENT_STATIONS).network
+    given = nets.known_points({each.id: np.array([along * k, 0.0, 0.0]) for k, each in enumerate(truth.points)})
+    with pytest.raises(AdjustmentError, match=f"known points, and all lie {where}. Correct their"):
+        approximate(replace(truth, points=given))
+
+
+@pytest.mark.parametrize("factor", [1000.0, 100.0])
+def test_marks_in_another_unit_than_the_frame_are_refused(factor: float) -> None:
+    network = nets.board_network(np.random.default_rng(1), 3, 1e-4)
+    wide = replace(network.observations, xy_mm=factor * network.observations.xy_mm)
+    with pytest.raises(AdjustmentError, match=r"frame_mm is \[3.2, 2.4\]: one of them is in another unit"):
+        adjust(replace(network, observations=wide))

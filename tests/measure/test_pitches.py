@@ -20,7 +20,7 @@ from measure import FiducialOptions, FrameMeasurement, Scan, Status, measure_fid
 from measure.detection.responses import SearchEffort
 from measure.fiducials.channel_weights import best_weights, registered_channels
 from measure.fiducials.options import CLICK_SIGMA_PX, Click
-from measure.fiducials.scan_checks import pitch_problem, second_frame
+from measure.fiducials.scan_checks import other_frames, pitch_problem
 from measure.fiducials.search import FrameSearch, PitchHypothesis, is_lattice
 from measure.fiducials.stages import false_placements
 from measure.flags import Cause, Code, Reason
@@ -301,7 +301,7 @@ def test_a_second_frame_is_named_with_the_windows_of_both(second: str | None, is
     scan = crop_scan(file, (13, 21, both.shape[1], both.shape[0]))  # the windows are those of the whole file
     window = (0, draw.FRAME_PX, draw.FRAME_PX, draw.FRAME_PX)
     frame = measure_fiducials(crop_scan(scan, window), draw.ALIKE, (draw.PITCH_UM, draw.PITCH_UM), options)
-    result = second_frame(scan, draw.ALIKE, shift_frame(frame, np.array([0.0, draw.FRAME_PX])), options)
+    result = other_frames(scan, draw.ALIKE, shift_frame(frame, np.array([0.0, draw.FRAME_PX])), options)
     assert bool(result) == is_named
     if is_named:
         windows = re.findall(r'"(\d+) (\d+) (\d+) (\d+)"', result)
@@ -310,6 +310,20 @@ def test_a_second_frame_is_named_with_the_windows_of_both(second: str | None, is
         assert upper == pytest.approx(21 + 27, abs=6)
         assert left == pytest.approx(13 + 30, abs=8)
         assert height == pytest.approx(343, abs=8)
+
+
+def test_every_further_frame_is_named() -> None:
+    """Three side by side, of which the middle one was measured."""
+    pictures = [draw.frame_picture(draw.ALIKE, draw.pixel_from_camera("0"), seed) for seed in (1, 2, 3)]
+    scan, pitch_um = draw.make_scan(np.hstack(pictures)), (draw.PITCH_UM, draw.PITCH_UM)
+    window = (draw.FRAME_PX, 0, draw.FRAME_PX, draw.FRAME_PX)
+    frame = measure_fiducials(crop_scan(scan, window), draw.ALIKE, pitch_um, FiducialOptions("0"))
+    shown = shift_frame(frame, np.array([draw.FRAME_PX, 0.0]))
+    result = other_frames(scan, draw.ALIKE, shown, FiducialOptions("0"))
+    assert "shows 3 frames" in result
+    assert "List all in images.csv" in result
+    first_columns = sorted(int(column) for column in re.findall(r'"(\d+) \d+ \d+ \d+"', result))
+    np.testing.assert_allclose(first_columns, draw.FRAME_PX * np.arange(3) + 30, atol=8)
 
 
 NOISE = Covariance.from_noise(np.diag([0.04, 0.09]))

@@ -223,10 +223,11 @@ def test_what_is_missing_for_a_camera_or_a_project_is_reported(tmp_path: Path) -
 
 
 def test_points_and_orientations_fixed_free_and_unknown(tmp_path: Path) -> None:
-    text = "point,X,Y,Z,sX,sY,sZ\n# a comment\n1,1,2,3,0,0.5,\n2,,,7,,,0.02\n"
+    text = "point,X,Y,Z,sX,sY,sZ\n# a comment\n1,\N{MINUS SIGN}1,2,3,0,0.5,\n2,,,7,,,0.02\n"
     points = {point.id: point for point in read_points(written(tmp_path, "points.csv", text)).points}
     sigmas = {id: [axis and axis.sigma for axis in (point.X, point.Y, point.Z)] for id, point in points.items()}
     assert sigmas == {"1": [0.0, 0.5, math.inf], "2": [None, None, 0.02]}
+    assert present(points["1"].X).value == -1.0
     text = "image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg,sX0\na.tif,1,2,3,10,20,90,0.1\nb.2,,,,,,,\n"
     images = read_images(written(tmp_path, "images.csv", text))
     exterior = present(images.exterior["a"])
@@ -393,6 +394,7 @@ TONE = 'camera = "camera.toml"\n[measure]\ntone = '
         (read_points, "point,X,Y,Z,sx\n1,1,2,3,0\n", ["'sx'", "Did you mean 'sX'"]),
         (read_points, "point,X,Y,Z\n1,1,2,3a\n", ["line 2", "column Z", "'3a'"]),
         (read_points, "point,X,Y,Z\n1,1,5,2,0,3,0\n", ["line 2", "7 values", "4 columns", "commas"]),
+        (read_points, "point,X,Y,Z\n1,1_000,2,3\n", ["line 2, column X: must be a number", "'1_000'"]),
         (read_points, "point,X,Y,Z,sX,sY,sZ\n1,1,2,3,-1,0,0\n", ["negative"]),
         (read_points, "point,X,Y,Z,sX,sY,sZ\n1,,2,3,1,0,0\n", ["X", "blank"]),
         (read_points, "point,X,Y,Z\n1,1,2,3\n2,4,5", ["line 3", "cut short", "3 of the 4 values"]),

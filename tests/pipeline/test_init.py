@@ -95,6 +95,8 @@ def test_files_are_sorted_into_kinds_copies_and_broken_ones(box: Path, tmp_path:
     data[-1] ^= 1
     first.with_name("b.tif").write_bytes(data)
     assert catalogue([first.parent], no_count).copies == {}
+    (first.parent / "0.tif").symlink_to("b.tif")
+    assert catalogue([first.parent], no_count).copies == {first.with_name("0.tif"): first.with_name("b.tif")}
 
 
 def identify_camera(
