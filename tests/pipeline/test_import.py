@@ -142,6 +142,7 @@ ENTITIES = '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]><a>&c
         ("micmac", "<a>" * 200, "more than 100 deep"),
         ("micmac", "<a><b></a>", "is not valid XML"),
         ("micmac", "<a/>", "has no <MesureAppuiFlottant1Im>"),
+        ("micmac", MARKS.format("1 x"), "should be 2 numbers"),
         ("micmac", MARKS.format("1 nan"), "should be 2 numbers"),
         ("opencv", "%YAML:1.0\n---\nK: 5\n", "with a camera in it"),
         ("opencv", "no yaml \x01 at all", "cv2.FileStorage"),

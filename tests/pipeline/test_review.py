@@ -5,7 +5,7 @@ import shutil
 import sqlite3
 import time
 import tracemalloc
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,6 +29,7 @@ from pipeline.archive.review_decisions import after_checks, apply_decisions, bef
 from pipeline.errors import InputError, WriteError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.decisions_file import Decision, DecisionKind, append_decisions, read_decisions, standing
+from pipeline.files.project_file import Project
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.review.pictures import Pictures, _overlapping_pixels
@@ -55,6 +56,19 @@ def page(browser: Browser, server: review.Served, measured_folder: Path) -> Iter
         one.goto(server.address)
         expect(one.locator("#left")).to_contain_text("3 left: 1 frame, 2 marks")
         yield one
+
+
+def test_the_command_serves_its_project(tmp_path: Path, printed: Printed, monkeypatch: pytest.MonkeyPatch) -> None:
+    project = write_project(tmp_path / "p", ["a"])
+
+    def serve(given: Project, port: int, who: str | None, opens: bool, say: Callable[[str], None]) -> None:
+        assert (given.path, port, who, opens) == (project, 7, "ann", False)
+        say("http://127.0.0.1:7/?token=t")
+
+    monkeypatch.setattr("pipeline.review.server.serve", serve)
+    lines = printed("review", project, "--no-browser", "--who", "ann", "--port", "7").splitlines()
+    assert lines[0] == "http://127.0.0.1:7/?token=t"
+    assert f"reseau run {project}" in lines[-1]
 
 
 def test_only_who_has_the_address_is_answered(server: review.Served) -> None:
