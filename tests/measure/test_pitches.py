@@ -263,12 +263,14 @@ PLACES = {f"{x}{y}": (106.0 * x, 106.0 * y) for x in (-1, 0, 1) for y in (-1, 0,
 RADIUS_MM, OBLIQUE_FILM_PITCH_UM, FRAME_MM = 1.5, 200.0, (228.0, 228.0)
 
 
-def test_balls_under_a_perspective_are_found_and_the_perspective_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("model", "tilt_deg"), [("affine", 6.5), ("projective", 10.0)])
+def test_balls_under_a_perspective_are_found_and_the_perspective_is_named(
+    tmp_path: Path, model: str, tilt_deg: float
+) -> None:
     ball = scenes.DrawnMark((disk((0.0, 0.0), RADIUS_MM),))
     fiducials = tuple(scenes.SceneFiducial(*one, ball) for one in PLACES.items())
     camera = scenes.SceneCamera("film", FRAME_MM, 150.0, fiducials=fiducials)
-    tilt_deg = float(np.degrees(np.arcsin(0.04 * 600.0 / 212.0)))
-    film = scenes.SceneFilm("projective", tilt_deg=tilt_deg, tilt_direction_deg=40.0)
+    film = scenes.SceneFilm("projective", tilt_deg=tilt_deg, tilt_direction_deg=5.0)
     scanner = scenes.SceneScanner((OBLIQUE_FILM_PITCH_UM, OBLIQUE_FILM_PITCH_UM), margin_mm=6.0, noise=0.01)
     image = scenes.SceneImage("f", (0.0, 0.0, 3.0, 0.0, 0.0, 0.0))
     scene = scenes.Scene("film", 1, camera, hidden_field(), (image,), scanner, film, scenes.Tones(contrast=0.0))
@@ -276,14 +278,16 @@ def test_balls_under_a_perspective_are_found_and_the_perspective_is_named(tmp_pa
     shape = MarkShape((Disk((0.0, 0.0), RADIUS_MM),), "light")
     layout = FiducialLayout(tuple(LayoutMark(k, xy, (0.002, 0.002), shape) for k, xy in PLACES.items()), FRAME_MM)
     with open_scan(tmp_path / "scans" / "f.tif") as scan:
-        frame = measure_fiducials(
-            scan.replace_tone(LINEAR), layout, (OBLIQUE_FILM_PITCH_UM, OBLIQUE_FILM_PITCH_UM), FiducialOptions("0")
-        )
+        options, pitch_um = FiducialOptions("0", film_model=model), (OBLIQUE_FILM_PITCH_UM, OBLIQUE_FILM_PITCH_UM)
+        frame = measure_fiducials(scan.replace_tone(LINEAR), layout, pitch_um, options)
     assert {mark.status for mark in frame.marks} == {Status.MEASURED}
     for mark in frame.marks:
         assert np.abs(center(mark) - truth.fiducials[mark.point].center_px).max() < 0.05
-    (problem,) = (each for each in frame.problems if Code.PERSPECTIVE in each.codes)
-    assert 'transformation = "projective"' in problem
+    if model == "projective":
+        assert frame.problems == ()
+    else:
+        (problem,) = (each for each in frame.problems if Code.PERSPECTIVE in each.codes)
+        assert 'transformation = "projective"' in problem
 
 
 @parametrize_with_studies(("second", "is_named"), [("0", True), ("90", True), (None, False)])
