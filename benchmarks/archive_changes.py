@@ -44,7 +44,7 @@ CHANGES: dict[str, Callable[[Path], object]] = {
     "one file moved to another folder": move_files,
     "one file renamed": lambda folder: (folder / "f2.tif").rename(folder / "g.tif"),
     "one pixel of one file changed": pixel,
-    "one setting of [measure]": rewritten("project.toml", 'pose = "0"', 'pose = "0"\ntone = "linear"'),
+    "one setting of [measure]": rewritten("project.toml", 'tone = "linear"', 'tone = "auto"'),
     "one mark drawn otherwise": rewritten("camera.toml", "line_mm = 0.1\n", "line_mm = 0.11\n"),
     "a setting of [adjust]": rewritten("project.toml", "[measure]", "[adjust]\nrobust = true\n[measure]"),
     "one scan more": lambda folder: pixel(folder, "f2.tif", "g.tif"),
