@@ -96,7 +96,8 @@ def network_hypotheses(network: Network, bare: Network, given: Adjustment | None
     heights = _one_axis(network, (2,)) if is_far else ()  # before distances, of which one may do the same
     # With any units of the axes linear transformations of the given points fit all images, but the adjustment does not.
     large_mm = LARGE * np.ptp(network.observations.xy_mm)
-    misses = given is None or not given.converged or np.sqrt(np.mean(given.residuals.v_mm**2)) > large_mm
+    # Images that look straight at a flat field cannot start either, and fit a stretched one by tilts.
+    misses = given is not None and (not given.converged or np.sqrt(np.mean(given.residuals.v_mm**2)) > large_mm)
     is_stretched = is_far and misses and all(each.misfit < LARGE for each in transformed_fields(network))
     plane = _one_axis(network, (0, 1)) if is_stretched else ()
     yield from ([each] for each in chain(exchanged, heights, mirrored_images, _distances(network), plane))

@@ -254,9 +254,10 @@ def _own_affinities(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     affine = np.array([unknowns.transformation[name] for name in names])
     added = affine[:, 1:3].ravel()
     # Affinities of all images of a flat object leave the interior orientation open, and contain the camera's own: these
-    # are held where they are.
+    # are held where they are, but where they are given with a standard deviation, which is an observation.
     known = {*INTERIOR_NAMES, *dict(lens_family.groups).get("affinity", ())}
-    sigma[unknowns.camera[camera.name][[name in known for name in (*INTERIOR_NAMES, *lens_family.parameters)]]] = 0.0
+    own = unknowns.camera[camera.name][[name in known for name in (*INTERIOR_NAMES, *lens_family.parameters)]]
+    sigma[own[np.isinf(sigma[own])]] = 0.0
     sigma[np.setdiff1d(affine, added)] = 0.0
     held = replace(problem, unknowns=replace(unknowns, sigma=sigma))
     yield ModelHypothesis("affinities", words, held, added)
