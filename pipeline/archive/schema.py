@@ -22,7 +22,16 @@ DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # damaged files: even SQL
 APPLICATION = 0x52455345  # "RESE": identifies the file for `file` and this program
 MARKS = ", ".join(("number", *MARK_COLUMNS))
 
-_FIRST = """
+_CHECKED_MARKS = """
+select f.judging, f.name as image, f.scan, f.verdict, m.* from judged_frame f
+join mark m on m.result = f.result where not f.own_marks
+union all
+select f.judging, f.name, f.scan, f.verdict, m.result, m.number, m.point, m.kind, m.col_px, m.row_px, m.var_col,
+    m.var_row, m.cov, m.causes, m.status, m.reason_code, m.reason, m.quality from judged_frame f
+join judged m on m.judging = f.judging and m.result = f.result where f.own_marks
+"""
+
+_FIRST = f"""
 create table scan (
     id integer primary key,
     name text unique,                        -- the image's; null: no scan of the project any more
@@ -98,12 +107,7 @@ create table judged_lot (
 create index judged_lot_by_input on judged_lot (input);
 create table kept (key text primary key, value text not null, digest text);   -- what scans of a project tell all others
 create view checked_mark as                  -- after the checks: of the raw result where these changed none
-select f.judging, f.name as image, f.scan, f.verdict, m.* from judged_frame f
-join mark m on m.result = f.result where not f.own_marks
-union all
-select f.judging, f.name, f.scan, f.verdict, m.result, m.number, m.point, m.kind, m.col_px, m.row_px, m.var_col,
-    m.var_row, m.cov, m.causes, m.status, m.reason_code, m.reason, m.quality from judged_frame f
-join judged m on m.judging = f.judging and m.result = f.result where f.own_marks;
+{_CHECKED_MARKS};
 create view mark_view as
 with pitch as (select id, pitch_x_um / 1000.0 as px_mm, pitch_y_um / 1000.0 as py_mm from result)
 select image, point, kind, col_px * px_mm as x_mm, -row_px * py_mm as y_mm,
@@ -374,6 +378,8 @@ def open_database(path: Path, schema: Schema = MEASUREMENTS) -> sqlite3.Connecti
         if schema.application == APPLICATION:
             _add_triggers(connection)
             connection.execute(_CHECKED_FRAMES)
+            # The file's own text of this view may be damaged, and has no digest.
+            connection.execute(f"create temp view checked_mark as {_CHECKED_MARKS}")
     except BaseException as error:
         connection.close()  # which rolls back an unfinished step
         if isinstance(error, DATABASE_ERRORS):

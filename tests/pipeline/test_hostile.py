@@ -256,6 +256,17 @@ def test_a_changed_digest_is_never_taken_for_no_judging(measured_folder: Path, t
         assert all(is_right(found[name], right[name]) for name in right), at
 
 
+def test_a_damaged_view_of_the_checked_marks_is_not_used(measured_folder: Path, tmp_path: Path) -> None:
+    """SQLite ends the text of a view at a byte 0: then marks that a person rejected were measured."""
+    place = tmp_path / "p"
+    right, path = readings(measured_folder), place / "out" / "measurement.db"
+    shutil.copytree(measured_folder, place)
+    data = path.read_bytes()
+    assert data.count(b"where not f.own_marks") == 1
+    path.write_bytes(data.replace(b"where not f.own_marks", b"\0here not f.own_marks"))
+    assert readings(place) == right
+
+
 @parametrize_with_studies(("trials", "seed"), [(4, 1), (600, 36)])
 @pytest.mark.parametrize("damage", [spoil_file, change_values])
 def test_damaged_databases(trials: int, seed: int, damage: Damage, measured_folder: Path, tmp_path: Path) -> None:
