@@ -80,7 +80,7 @@ class Code(MeaningfulWord):
     FEW_TIES = "few-ties", "Fewer natural points were found than wanted."
     OTHER_PART = "other-part", "Another part of the same frame shows it."
     COPY = "copy", "The scan is a copy of another one, or shows the board where that does; its marks are used."
-    SECOND_PICTURE = "second-picture", "The file holds a second image of full size, or the scan shows a second frame."
+    SECOND_PICTURE = "second-picture", "The file holds a second image of full size, or the scan shows further frames."
     CLICKED = "clicked", "A person pointed at it, and nothing could be matched there."
     DECIDED = "decided", "A person decided so."
 

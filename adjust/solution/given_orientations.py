@@ -150,12 +150,12 @@ def orientations_elsewhere(network: Network, result: Adjustment, is_observed: bo
     compared = _Compared.from_result(network, result, given)
     return (
         _other_unit(network, compared.stations, compared.places)
-        or _other_table(compared, is_observed)
+        or _misread_table(compared, is_observed)
         or _mirrored_points(compared, _points(result))
     )
 
 
-def _other_table(compared: _Compared, is_observed: bool) -> str:
+def _misread_table(compared: _Compared, is_observed: bool) -> str:
     """Describe exchanged names, or another reading of all rows; empty where neither explains the orientations."""
     stations, places, depths, angles = compared.stations, compared.places, compared.depths, compared.angles
     off = np.flatnonzero(~is_near(stations, places, depths))

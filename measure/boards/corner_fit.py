@@ -381,7 +381,7 @@ class _CornerFits(FitModel):
         informative = self.ends[numbers] * residuals >= 0
         self.design[numbers], self.residuals[numbers] = design * informative[:, None], residuals * informative
 
-    def weights_of(self, fits: Indices) -> Single:
+    def pixel_weights(self, fits: Indices) -> Single:
         """Tukey's weights in the area around each corner."""
         relative = np.asarray(self.residuals[fits] / self.scale[fits, None], np.float32)
         self.weights[fits] = np.asarray(self._area(fits) * tukey_weights(relative, 1.0), np.float32)

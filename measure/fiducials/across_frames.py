@@ -238,7 +238,7 @@ def explain(frames: Frames, sites: MisfitPattern, believed_mm: float) -> FramesE
                 place: pattern.expected_marks(place, alike[each.pose] >= _FEWEST_ALIKE)
                 for place, each in frames.items()
             }
-            film, is_more = _film([expected[place] for place in ordinary], believed_mm, 2)
+            film, is_more = _film([expected[place] for place in ordinary], believed_mm, fewest=2)
             films_mm = films_mm | {place: _own_film_mm(expected[place], film) for place in ordinary}
         affinities = _affinities({place: (expected[place], frames[place].pose) for place in ordinary}, film.sigma)
         tests = {}

@@ -197,7 +197,6 @@ def _rivals(result: SearchResult, frame: Frame) -> list[Reason]:
     """Warn of other placements in the same pose that are nearly as good, or that show another frame."""
     problems, best, fits = [], frame.placement, frame.inlier_fits
     found_mm, found_px = frame.camera_mm[list(fits)], np.array([fit.center_px for fit in fits.values()]).reshape(-1, 2)
-    is_oblique = frame.options.film_model == "projective"
     for other in result.placements:
         is_rival = other.pose == best.pose and other.pitch_mm == best.pitch_mm and not other.same_place(best)
         if not is_rival:
@@ -206,8 +205,10 @@ def _rivals(result: SearchResult, frame: Frame) -> list[Reason]:
         # perspective of a film photographed obliquely, if they are nearest to it under the names they have.
         if fits and np.hypot(*(other.places_px(found_mm) - found_px).T).max() <= frame.first_search_px:
             continue
-        if fits and is_oblique and (cKDTree(other.places_px(frame.camera_mm)).query(found_px)[1] == list(fits)).all():
-            continue
+        if fits and frame.options.is_oblique:
+            nearest = cKDTree(other.places_px(frame.camera_mm)).query(found_px)[1]
+            if (nearest == list(fits)).all():
+                continue
         as_good = other.score >= _AMBIGUOUS * best.score and (
             other.supported >= best.supported - 1 or _lacks_its_own(frame, other)
         )
@@ -356,7 +357,7 @@ def _orientation_problems(frame: Frame, pitch_um: tuple[float, float] | None) ->
     per_mm = np.hypot(*frame.pixel_from_camera[:, :2].T)
     expected = pitch_um or (1.0, 1.0)
     unequal = abs(per_mm[0] * expected[0] / (per_mm[1] * expected[1]) - 1)
-    if unequal > 2 * AFFINITY_SIGMA and frame.options.film_model != "projective":  # a tilt foreshortens the film
+    if unequal > 2 * AFFINITY_SIGMA and not frame.options.is_oblique:  # a tilt foreshortens the film
         wide_um, tall_um = 1000 / per_mm[0], 1000 / per_mm[1]
         if pitch_um is None:
             given, cause = "no pitch is given, so that pixels are taken as square", "pixels that are not square"

@@ -125,6 +125,11 @@ class FiducialOptions:
                 raise ValueError(f"{name} is {getattr(self, name)}; a positive number is right")
         film_terms(self.film_model, np.zeros((1, 2)))  # raises ValueError for a model that is not known
 
+    @property
+    def is_oblique(self) -> bool:
+        """Whether the film was photographed obliquely, so that its picture has a perspective."""
+        return self.film_model == "projective"
+
     def search_mm(self, layout: FiducialLayout) -> float:
         """Largest deviation of a mark of the layout from its given place in the search."""
         places = layout.places_mm

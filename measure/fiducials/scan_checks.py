@@ -14,13 +14,13 @@ from measure.flags import NO_REASON, RIGHT_PITCH_REFUSED, Code, Reason, Status
 from measure.marks.shapes import FiducialLayout, places_mm
 from measure.results import FrameMeasurement, MarkMeasurement
 from measure.scans.opening import crop_scan
+from measure.scans.remote import Window
 from measure.scans.scan import Scan
 
 _LEAST_MARKS = 3  # with two, a false one yields a wrong pitch
 _ROOM = 0.9  # fraction of the frame's sides: a free margin narrower than this holds no second frame
 _MOST_MARKS = 0.75  # fraction of the layout's marks that must be measured in a second frame
 _FEWEST_MARKS = 3
-Window = tuple[int, int, int, int]  # first column and row, width, height
 _REACH_PX = 20.0  # around a mark of unknown size: that of a disk or crossing of a test field, with its background
 
 
@@ -111,12 +111,12 @@ def other_frames(scan: Scan, layout: FiducialLayout, frame: FrameMeasurement, op
 def _rests(areas: Sequence[Window], outline: Array) -> list[Window]:
     """What an outline leaves of areas: the largest rectangles beside it."""
     col0, row0, col1, row1 = (int(value) for value in outline)
-    rests = dict.fromkeys(areas, False)
+    rests = list[Window]()
     for area in areas:
         col, row, width, height = area
         left, upper, right, lower = max(col0, col), max(row0, row), min(col1, col + width), min(row1, row + height)
         if left >= right or upper >= lower:
-            rests[area] = True
+            rests.append(area)
             continue
         sides = (
             (col, row, left - col, height),
@@ -124,8 +124,8 @@ def _rests(areas: Sequence[Window], outline: Array) -> list[Window]:
             (col, row, width, upper - row),
             (col, lower, width, row + height - lower),
         )
-        rests |= {each: each[2] > 0 and each[3] > 0 for each in sides}
-    return [area for area, is_free in rests.items() if is_free]
+        rests += [side for side in sides if side[2] > 0 and side[3] > 0]
+    return list(dict.fromkeys(rests))
 
 
 def _is_within(window: Window, other: Window) -> bool:

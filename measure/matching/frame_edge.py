@@ -149,9 +149,6 @@ class _Steps(FitModel):
         ground, self.drawn = (light - self.contrast[:, None] * self.design[:, 2]).mean(axis=1), light - self.residuals
         self.stored_contrast = np.array(list(map(coding.stored_contrast_dn, ground.tolist(), self.contrast.tolist())))
 
-    def weights_of(self, fits: Indices) -> Array:
-        return np.ones_like(self.residuals[fits])
-
     def step(self, fits: Indices, steps: Array) -> Array:
         """Apply steps of limited length and linearise there."""
         moves = np.clip(steps[:, 0], -1.0, 1.0)

@@ -1,6 +1,7 @@
 """Gauss-Newton driver of all fits to images, and the adjustment of one mark in stages: plain, robust, damage masked,
 weighted by grain."""
 
+from abc import ABC, abstractmethod
 from dataclasses import replace
 from typing import Any
 
@@ -54,18 +55,16 @@ _GROUND = 0.1  # fraction of the mark's contrast: pixels that show less are back
 _OWN = 0.3  # fraction of the mark's contrast: pixels that show more are the mark
 
 
-class FitModel:
+class FitModel(ABC):
     """Fits of one model to n images, side by side. It owns their residuals, derivatives, weights and priors.
 
     Attributes
     ----------
     reasons : why fits failed or did not converge; empty for the others.
-    state : replaced by each step, of a single fit whose steps can be halved.
     design, residuals : (n, unknowns, pixels) and (n, pixels) at the current states.
     damping : of the steps (`gauss_newton_step`).
     """
 
-    state: Any
     design: NDArray[Any]
     residuals: NDArray[Any]
     damping = 0.0
@@ -73,21 +72,17 @@ class FitModel:
     def __init__(self, count: int) -> None:
         self.reasons, self.every = [NO_REASON] * count, np.arange(count)
 
-    def weights_of(self, fits: Indices) -> NDArray[Any]:
-        """Weights (m, pixels) of m fits at their states."""
-        raise NotImplementedError
+    @abstractmethod
+    def step(self, fits: Indices, steps: Array) -> Array:
+        """Apply the steps of m fits, linearise there, and give reasons. Returns the movements (m,) of the marks, px."""
+
+    def pixel_weights(self, fits: Indices) -> NDArray[Any]:
+        """Weights (m, pixels) of m fits at their states; equal ones by default."""
+        return np.ones_like(self.residuals[fits])
 
     def solve(self, fits: Indices) -> Array:
         """Solve the normal equations of m fits. Returns the steps (m, unknowns), nan if singular."""
-        return gauss_newton_step(self.design[fits], self.residuals[fits], self.weights_of(fits), self.damping)
-
-    def step(self, fits: Indices, steps: Array) -> Array:
-        """Apply the steps of m fits, linearise there, and give reasons. Returns the movements (m,) of the marks, px."""
-        raise NotImplementedError
-
-    def cost(self) -> float:
-        """Objective function that the steps of a single fit reduce."""
-        raise NotImplementedError
+        return gauss_newton_step(self.design[fits], self.residuals[fits], self.pixel_weights(fits), self.damping)
 
     def refuse(self, fits: Indices, reason: Reason) -> None:
         """Give this reason to the fits that have none yet."""
@@ -95,7 +90,7 @@ class FitModel:
             self.reasons[number] = self.reasons[number] or reason
 
 
-def gauss_newton(model: FitModel, fits: Indices, tolerance_px: float, iterations: int, halvings: int = 0) -> Array:
+def gauss_newton(model: FitModel, fits: Indices, tolerance_px: float, iterations: int) -> Array:
     """Iterate some fits of a model, each until it moves less than a tolerance or fails.
 
     Parameters
@@ -103,7 +98,6 @@ def gauss_newton(model: FitModel, fits: Indices, tolerance_px: float, iterations
     model : left at its last state, with reasons for the fits that are singular or do not converge.
     fits : (m,) their numbers.
     iterations : maximum number of steps.
-    halvings : maximum number of halvings of a step that does not reduce the cost of a single fit.
 
     Returns
     -------
@@ -116,31 +110,12 @@ def gauss_newton(model: FitModel, fits: Indices, tolerance_px: float, iterations
         model.refuse(fits[moving[~is_regular]], UNDETERMINED)
         moving, steps = moving[is_regular], steps[is_regular]
         if len(moving):
-            own = fits[moving], steps
-            moved_px[moving] = _halved_step(model, *own, tolerance_px, halvings) if halvings else model.step(*own)
+            moved_px[moving] = model.step(fits[moving], steps)
         goes_on = [not model.reasons[number] for number in fits[moving]]
         moving = moving[(moved_px[moving] >= tolerance_px) & np.array(goes_on, dtype=bool)]
         if not len(moving):
             break
     model.refuse(fits[moving], UNSETTLED)
-    return moved_px
-
-
-def _halved_step(model: FitModel, fits: Indices, steps: Array, tolerance_px: float, halvings: int) -> Array:
-    """Apply a step, halved until it reduces the cost; none if no part does and the last one was short."""
-    before, cost_before = model.state, model.cost()
-    moved_px = model.step(fits, steps)
-    if moved_px < tolerance_px:
-        return moved_px
-    for _ in range(halvings):
-        if model.cost() <= cost_before:
-            return moved_px
-        steps, model.state = steps / 2, before
-        moved_px = model.step(fits, steps)
-    if model.cost() > cost_before and float(np.hypot(*steps[0, :2])) < tolerance_px:
-        # Size, blur and contrast are correlated here: the cost is flat at the minimum.
-        model.state = before
-        return model.step(fits, np.zeros_like(steps))
     return moved_px
 
 
@@ -156,6 +131,7 @@ class PictureFit(FitModel):
     variance_dn2 : variance of unit weight.
     scale_dn : scale of Tukey's weights; infinite for plain least squares.
     weighted : (unknowns, height, width) derivatives times the grain's weights; None before these are used.
+    tolerance_px : movement below which the fit has converged.
     """
 
     def __init__(self, model: PictureModel, window: ScanWindow) -> None:
@@ -163,7 +139,7 @@ class PictureFit(FitModel):
         self.model, self.window, self.options = model, window, model.options
         self.area = self.used = window.usable
         self.far = np.zeros_like(self.area)
-        self.variance_dn2, self.scale_dn = 1.0, np.inf
+        self.variance_dn2, self.scale_dn, self.tolerance_px = 1.0, np.inf, 0.0
         self.weighted: Array | None = None
 
     @property
@@ -270,7 +246,8 @@ class PictureFit(FitModel):
             own = self.informative & (shown > _OWN * shown[self.area].max(initial=0.0))
             misfit_dn = robust_scale(model.residuals[own]) if own.sum() >= _LEAST_AREA_PX else 0.0
             self.scale_dn = max(noise_dn, misfit_dn, _SCALE_FLOOR * self.contrast_dn)
-        gauss_newton(self, self.every, tolerance_px, _ITERATIONS, _HALVINGS)
+        self.tolerance_px = tolerance_px
+        gauss_newton(self, self.every, tolerance_px, _ITERATIONS)
 
     def solve(self, fits: Indices) -> Array:
         """Solve the normal equations with Tukey's or the grain's weights. A blur at its limit is held fixed there."""
@@ -288,11 +265,33 @@ class PictureFit(FitModel):
         return step[None]
 
     def step(self, fits: Indices, steps: Array) -> Array:
-        """Apply a step and linearise there. Sets the reason if the state is not acceptable."""
-        moved_px = self.model.step(steps[0])
-        self.model.linearise(self.used)
+        """Apply a step, halved where it does not reduce the cost, whole with the grain's weights, and linearise there.
+        Sets the reason if the state is not acceptable."""
+        moved_px = self._descend(steps[0]) if self.weighted is None else self._move(steps[0])
         self.reason = self.failure()
         return np.array([moved_px])
+
+    def _move(self, step: Array) -> float:
+        moved_px = self.model.step(step)
+        self.model.linearise(self.used)
+        return moved_px
+
+    def _descend(self, step: Array) -> float:
+        """Move by a step, halved until it reduces the cost; by none if no part does and the last one was short."""
+        before, cost_before = self.state, self.cost()
+        moved_px = self._move(step)
+        if moved_px < self.tolerance_px:
+            return moved_px
+        for _ in range(_HALVINGS):
+            if self.cost() <= cost_before:
+                return moved_px
+            step, self.state = step / 2, before
+            moved_px = self._move(step)
+        if self.cost() > cost_before and float(np.hypot(*step[:2])) < self.tolerance_px:
+            # Size, blur and contrast are correlated here: the cost is flat at the minimum.
+            self.state = before
+            return self._move(np.zeros_like(step))
+        return moved_px
 
     def failure(self) -> Reason:
         """Reason why the state is not acceptable: too far from the start or too distorted."""

@@ -178,7 +178,7 @@ class _DiskFit(FitModel):
         self.plain_steps -= 1
         return np.where(self.plain_steps < 0, np.linalg.norm(moves, axis=1), np.inf)
 
-    def weights_of(self, fits: Indices) -> Single:
+    def pixel_weights(self, fits: Indices) -> Single:
         """(m, pixels), Tukey's against dust and neighbours after plain steps."""
         informative: Mask = np.asarray(self.informative[fits])
         if self.plain_steps > 0:
@@ -188,7 +188,7 @@ class _DiskFit(FitModel):
 
     def placed(self) -> Iterator[MarkFit]:
         """The disks in scan pixels, with covariances."""
-        weights, found = self.weights_of(self.every), self.patches()
+        weights, found = self.pixel_weights(self.every), self.patches()
         counted = weights > _UNDAMAGED
         influence = self.shapes.astype(np.float32) @ place_influences(self.design, weights)
         size = len(weights), -1, self.side, self.side

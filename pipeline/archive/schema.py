@@ -18,7 +18,8 @@ from typing import Any, Self
 from pipeline.errors import InputError, what_to_do_about_database
 from pipeline.results.measured_record import MARK_COLUMNS
 
-DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # damaged files: even SQLite's message may be undecodable
+# Of damaged files: even SQLite's message may be undecodable, which sqlite3 may also tell by a SystemError.
+DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, SystemError)
 APPLICATION = 0x52455345  # "RESE": identifies the file for `file` and this program
 MARKS = ", ".join(("number", *MARK_COLUMNS))
 

@@ -103,7 +103,7 @@ def build_queue(project: Project, db: sqlite3.Connection | None, check_run: int)
     if db:
         verify_check_run(db, check_run, project.measurement_path)
     damaged = damaged_frames(db, check_run) if db else {}
-    frames = {frame.result: frame for frame in _frames(db, check_run) if frame.result not in damaged} if db else {}
+    frames = {frame.result: frame for frame in _frames(db, check_run, damaged)} if db else {}
     marks = sorted(_marks(db, check_run, frames), key=_badness) if db else []
     bare = [
         Entry(Question.FRAME, (image,), ("",), "", str(Verdict.FAILED), 0, str(damaged_result(image, name)))
@@ -166,9 +166,12 @@ order by abs(f.scan - own.scan) limit ?5
 """
 
 
-def _frames(db: sqlite3.Connection, check_run: int) -> Iterator[_Frame]:
+def _frames(db: sqlite3.Connection, check_run: int, damaged: Collection[int]) -> Iterator[_Frame]:
+    """Yield the frames whose stored results can be read. damaged: results that cannot."""
     found: dict[int, int] = dict(db.execute(_FOUND, (check_run,)).fetchall())
     for *frame, pose_json in db.execute(_FRAMES, (check_run,)):
+        if frame[1] in damaged:
+            continue
         pose = json.loads(pose_json or "null") or {"name": "", "decided": True, "evidence": [], "roll": ""}
         orientation = pose["name"], bool(pose["decided"]), " ".join(pose["evidence"]), pose["roll"]
         yield _Frame._make((*frame, found.get(frame[1], 0), *orientation))

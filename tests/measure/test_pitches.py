@@ -458,7 +458,7 @@ def test_windows_find_the_frame_of_the_scan(center: tuple[float, float], monkeyp
     assert np.hypot(*(found.pixel_from_camera - matrix)[:, 2]) < 3.0
 
 
-def test_orientations_that_look_the_same_are_searched_once_for_a_camera() -> None:
+def test_orientations_with_equal_marks_are_searched_once_for_a_camera() -> None:
     scan = draw.make_scan(draw.frame_picture(draw.ALIKE, draw.pixel_from_camera("0")))
     pitch_mm, options = (draw.PITCH_UM / 1000, draw.PITCH_UM / 1000), FiducialOptions()
     hypothesis = [PitchHypothesis(pitch_mm, 0.02, pitch_mm)]

@@ -12,6 +12,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
+from itertools import product
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -265,6 +266,21 @@ def test_a_damaged_view_of_the_checked_marks_is_not_used(measured_folder: Path, 
     assert data.count(b"where not f.own_marks") == 1
     path.write_bytes(data.replace(b"where not f.own_marks", b"\0here not f.own_marks"))
     assert readings(place) == right
+
+
+@pytest.mark.parametrize("words", [b"set in the project", b'"evidence"', b'"roll"', b"a.tif", b"measured"])
+def test_damaged_words_of_a_result_are_refused(words: bytes, measured_folder: Path, tmp_path: Path) -> None:
+    """A text that is no UTF-8, or lacks a key, is not read, wherever it stands."""
+    right, place = readings(measured_folder), tmp_path / "p"
+    shutil.copytree(measured_folder, place)
+    path = place / "out" / "measurement.db"
+    data = path.read_bytes()
+    places = [at for at in range(len(data)) if data.startswith(words, at)]
+    assert places
+    for at, byte in product(places, (b"\xff", b"x")):
+        path.write_bytes(data[: at + 2] + byte + data[at + 3 :])
+        found = readings(place)
+        assert all(is_right(found[name], right[name]) for name in right), at
 
 
 @parametrize_with_studies(("trials", "seed"), [(4, 1), (600, 36)])

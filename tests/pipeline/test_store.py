@@ -173,8 +173,8 @@ def test_what_was_kept_survives_a_kill_and_nothing_is_half(path: Path) -> None:
     complete = sum(len(os.read(reading, 1)) for _ in range(50))
     time.sleep(0.05)
     writer.kill()
-    while told := os.read(reading, 1000):
-        complete += len(told)
+    while written := os.read(reading, 1000):
+        complete += len(written)
     writer.join()
     os.close(reading)
     with ResultsDatabase(path) as database:
