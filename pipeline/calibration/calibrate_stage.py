@@ -147,6 +147,43 @@ class CalibrationResult(PlottedResult):
             console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
+@dataclass
+class _CalibrationProject:
+    """The project that is written for the pictures; turns and lenses follow what the adjustments show."""
+
+    pictures: BoardPictureFiles
+    out: Path
+    options: project_files.CalibrationOptions
+    lenses: dict[str, LensModel]
+
+    def write(self) -> Project:
+        return project_files.write_project(self.out, self.pictures, self.options, self.lenses)
+
+    def adjust_camera(
+        self, camera: CameraPictures, marks: Sequence[ComparatorPoint], left_out: Mapping[str, str]
+    ) -> tuple[Adjustment, LensChoice | None]:
+        """Adjust one camera with its turns and its lens determined. Raises AdjustmentError, or InputError."""
+        if any(turned is None for turned in camera.turned_deg.values()):
+            camera = find_turns(self.write(), marks, camera)
+            cameras = (camera if each.name == camera.name else each for each in self.pictures.cameras)
+            self.pictures = replace(self.pictures, cameras=tuple(cameras))
+        _check_count(camera, left_out)
+        project, choice = self.write(), None
+        adjustment = adjust_marks(project, marks)
+        if self.options.lens == "auto":
+            choice = _chosen_lens(project, adjustment, camera, self.options)
+            if choice.model != self.lenses[camera.name]:
+                self.lenses[camera.name] = choice.model
+                adjustment = adjust_marks(self.write(), marks)
+        if not adjustment.converged:
+            why = " ".join(adjustment.warnings[:1])
+            raise InputError(
+                f"the adjustment has no solution ({adjustment.termination}). {why} Take pictures with the "
+                "board tilted by 20 degrees and more in different directions, all over the picture."
+            )
+        return adjustment, choice
+
+
 def _calibrate_cameras(
     given: Sequence[Path], out: Path, options: project_files.CalibrationOptions, reporter: Reporter, workers: int | None
 ) -> CalibrationResult:
@@ -154,9 +191,8 @@ def _calibrate_cameras(
     pictures = find_pictures(given, out)
     project_files.check_folder(out, pictures)
     first: LensModel = "opencv4" if options.lens == "auto" else options.lens
-    lenses = dict.fromkeys((camera.name for camera in pictures.cameras), first)
-    project = project_files.write_project(out, pictures, options, lenses)
-    work = WorkOptions(workers=workers)
+    written = _CalibrationProject(pictures, out, options, {camera.name: first for camera in pictures.cameras})
+    project, work = written.write(), WorkOptions(workers=workers)
     run_measure(project, reporter, work)
     marks = read_comparator(project.comparator)
     left_out = _left_out(pictures, marks)
@@ -165,57 +201,44 @@ def _calibrate_cameras(
     with reporter.stage("calibrating") as count:
         for done, camera in enumerate(pictures.cameras, 1):
             count(camera.name, done, len(pictures.cameras))
-            own = [mark for mark in marks if mark.image in camera.images and mark.image not in left_out]
+            own = _used_marks(marks, camera, left_out)
             try:
-                if any(turned is None for turned in camera.turned_deg.values()):
-                    camera = find_turns(project, own, camera)
-                    cameras = (camera if each.name == camera.name else each for each in pictures.cameras)
-                    pictures = replace(pictures, cameras=tuple(cameras))
-                    project = project_files.write_project(out, pictures, options, lenses)
-                _check_count(camera, left_out)
-                adjustment, choice = adjust_marks(project, own), None
-                if options.lens == "auto":
-                    choice = _chosen_lens(project, adjustment, camera, options)
-                    if choice.model != first:
-                        lenses[camera.name] = choice.model
-                        adjustment = adjust_marks(project_files.write_project(out, pictures, options, lenses), own)
-                if not adjustment.converged:
-                    why = " ".join(adjustment.warnings[:1])
-                    raise InputError(
-                        f"the adjustment has no solution ({adjustment.termination}). {why} Take pictures with the "
-                        "board tilted by 20 degrees and more in different directions, all over the picture."
-                    )
-                adjustments[camera.name], choices[camera.name] = adjustment, choice
+                adjustments[camera.name], choices[camera.name] = written.adjust_camera(camera, own, left_out)
             except (AdjustmentError, InputError) as error:
                 not_calibrated[camera.name] = str(error)
     if not adjustments:
         raise InputError(_nothing(pictures, left_out, not_calibrated))
-    calibrated, names = pictures.select(adjustments)
-    project = project_files.write_project(out, calibrated, options, lenses)
+    written.pictures, names = written.pictures.select(adjustments)
+    project = written.write()
     if any(name != earlier for earlier, name in names.items()):  # the cameras left out had folders of their own
         left_out = {names[image]: why for image, why in left_out.items() if image in names}
         marks = tuple(replace(mark, image=names[mark.image]) for mark in marks if mark.image in names)
-        for camera in calibrated.cameras:
-            own = [mark for mark in marks if mark.image in camera.images and mark.image not in left_out]
-            adjustments[camera.name] = adjust_marks(project, own)
+        for camera in written.pictures.cameras:
+            adjustments[camera.name] = adjust_marks(project, _used_marks(marks, camera, left_out))
     summary = run_all(project, reporter, work)
     checks = read_check(project.check_path).cameras if project.check_path.exists() else {}
     found = []
-    for each in calibrated.cameras:
-        adjustment, choice = adjustments[each.name], choices[each.name]
+    for each in written.pictures.cameras:
+        adjustment = adjustments[each.name]
         reasons = {**left_out, **adjustment.left_out}
         own_reasons = {name: why for name, why in reasons.items() if name in each.images}
-        check = checks.get(each.name)
+        choice, check = choices[each.name], checks.get(each.name)
         found.append(
             camera_intrinsics(adjustment, each, options.pixel_mm, own_reasons, choice, options.pitch_um, check)
         )
-    files = dict(project_files.camera_files(found, out, options.ros))
-    for path, text in files.items():
+    texts = dict(project_files.camera_files(found, out, options.ros))
+    for path, text in texts.items():
         write_atomically(path, text)
-    written = (*files, project.report_path, project.path)
+    files = (*texts, project.report_path, project.path)
     return CalibrationResult(
-        tuple(found), pictures.unreadable, not_calibrated, written, summary, adjustments, options.pixel_mm
+        tuple(found), pictures.unreadable, not_calibrated, files, summary, adjustments, options.pixel_mm
     )
+
+
+def _used_marks(
+    marks: Iterable[ComparatorPoint], camera: CameraPictures, left_out: Mapping[str, str]
+) -> list[ComparatorPoint]:
+    return [mark for mark in marks if mark.image in camera.images and mark.image not in left_out]
 
 
 def _left_out(pictures: BoardPictureFiles, marks: Sequence[ComparatorPoint]) -> dict[str, str]:
