@@ -146,14 +146,15 @@ def run_import(format: str, paths: Sequence[Path], folder: Path, options: Import
     files: dict[str, str | bytes] = dict(incoming.tables)
     if incoming.marks:
         files["comparator.csv"] = _comparator(incoming.marks, options)
-    cameras = _cameras(incoming.cameras)
+    is_one = len(incoming.cameras) == 1 and {pose.camera for pose in incoming.poses} <= {incoming.cameras[0].name}
+    cameras = _cameras(incoming.cameras, is_one)
     if incoming.poses:
-        files["images.csv"] = _images(incoming.poses, [folder / name for name in cameras])
+        files["images.csv"] = _images(incoming.poses, [] if is_one else [folder / name for name in cameras])
     files |= cameras
     if not files:
         raise InputError(f"{', '.join(map(str, paths))}: there is nothing to import in it.")
     notes = (*incoming.notes, *_unknown_notes(incoming.cameras))
-    if len(cameras) > 1 and any(pose.camera for pose in incoming.poses):
+    if cameras and not is_one and any(pose.camera for pose in incoming.poses):
         notes += (
             f"images.csv names a camera file for each image, as {folder / next(iter(cameras))}: from the folder "
             "of project.toml.",
@@ -212,8 +213,8 @@ def _comparator(marks: Sequence[ForeignMark], options: ImportOptions) -> str:
 
 
 def _images(poses: Sequence[ForeignPose], cameras: Sequence[Path]) -> str:
-    """images.csv without standard deviations: approximate orientations, and camera files where there are several."""
-    file_of = {path.name: path.as_posix() for path in cameras if len(cameras) > 1}
+    """images.csv without standard deviations: approximate orientations, and camera files unless all have one."""
+    file_of = {path.name: path.as_posix() for path in cameras}
     columns = ("image", *ELEMENTS, "camera") if file_of else ("image", *ELEMENTS)
     lines = ["# orientations of another program, as approximations", ",".join(columns)]
     image, most = Counter(pose.image for pose in poses).most_common(1)[0]
@@ -236,11 +237,11 @@ def _camera_file(name: str) -> str:
     return f"{file_word(name or 'camera')}.toml"
 
 
-def _cameras(cameras: Sequence[CameraFile]) -> dict[str, str]:
-    """camera.toml, or one file per name where there are several cameras; equal ones once."""
+def _cameras(cameras: Sequence[CameraFile], is_one: bool) -> dict[str, str]:
+    """camera.toml where one is that of all images, else one file per name; equal ones once."""
     files: dict[str, str] = {}
     for camera in cameras:
-        name = "camera.toml" if len(cameras) == 1 else _camera_file(camera.name)
+        name = "camera.toml" if is_one else _camera_file(camera.name)
         text = camera_text(replace(camera, path=Path(name)), lambda *_: "")
         if files.setdefault(name, text) != text:
             raise InputError(

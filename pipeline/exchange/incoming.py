@@ -15,6 +15,7 @@ from pipeline.exchange.formats import Convention
 from pipeline.files.camera_file import CameraFile, GivenFiducial
 from pipeline.files.camera_tables import DEFAULT_SIGMA_MM
 from pipeline.text.files import read_bytes
+from pipeline.text.wording import counted
 from pipeline.types import Array
 
 Element = ElementTree.Element
@@ -76,7 +77,7 @@ def child_numbers(element: Element, name: str, count: int, path: Path) -> list[f
     except ValueError:
         values = []
     if len(values) != count or not all(map(math.isfinite, values)):
-        raise InputError(f"{path}: <{name}> is {text[:60]!r}; it should be {count} numbers.")
+        raise InputError(f"{path}: <{name}> is {text[:60]!r}; it should be {counted(count, 'number')}.")
     return values
 
 

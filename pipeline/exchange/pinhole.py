@@ -37,6 +37,7 @@ from pipeline.opencv_check.opencv_calibration import (
 from pipeline.resampling.canvas import Canvas, outline_canvas
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.text.files import image_name
+from pipeline.text.wording import listed
 from pipeline.types import Array
 
 ASP = Convention(
@@ -528,7 +529,9 @@ def import_colmap(paths: Sequence[Path], options: incoming.ImportOptions) -> inc
         for number, camera in sorted(made.cameras.items()):
             known = _parameters(camera)
             if known is None:
-                left_out.append(f"Camera {number} is of the model {camera.model_name}, which is not read.")
+                own = sorted(image_name(image.name) for image in made.images.values() if image.camera_id == number)
+                without = f" Images without a camera: {listed(own)}." if own else ""
+                left_out.append(f"Camera {number} is of the model {camera.model_name}, which is not read.{without}")
                 continue
             interior, lens = known
             size = (camera.width, camera.height)

@@ -26,6 +26,8 @@ _OPENCV = ("plumb_bob", "rational_polynomial", "radtan", "brown_conrady", "pinho
 _MATRIX = ("camera_matrix", "K", "Camera_Matrix", "cameraMatrix", "M1")
 _LENS = ("distortion_coefficients", "D", "Distortion_Coefficients", "distCoeffs", "D1")
 _WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height")
+_COUNTS = {"opencv": (0, 4, 5, 8, 12, 14), "opencv_fisheye": (0, 4)}  # of coefficients that OpenCV takes
+_MOST_PX = 1e6  # along a picture's side; a word reads as 1e308
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +79,15 @@ def yaml_text(values: Iterable[tuple[str, Any]]) -> str:
 
 
 def read_matrix(path: Path, node: Any) -> Array:
-    """Matrix of a node. Raises InputError where it is none."""
-    with suppress(cv2.error, ValueError, TypeError):
-        return np.atleast_1d(np.array(node.mat(), dtype=float))
+    """Matrix of a node, with its type or, as ROS writes it, without. Raises InputError where it is none."""
+    with suppress(cv2.error, SystemError):
+        content = node.mat()
+        return np.zeros(0) if content is None else np.atleast_1d(np.array(content, dtype=float))
+    with suppress(cv2.error, ValueError, OverflowError):
+        data, shape = node.getNode("data"), [int(node.getNode(side).real()) for side in ("rows", "cols")]
+        values = [data.at(i) for i in range(data.size())]
+        if all(value.isReal() or value.isInt() for value in values):
+            return np.reshape([value.real() for value in values], shape)
     raise InputError(f"{path}: {node.name()} is no matrix (!!opencv-matrix). Write it as cv2.FileStorage does.")
 
 
@@ -89,15 +97,19 @@ def _pixel_camera(path: Path, storage: Any) -> PixelCamera:
         return next((node for node in nodes if not node.empty()), None)
 
     matrix, lens, size, height = (first(names) for names in (_MATRIX, _LENS, _WIDTH, _HEIGHT))
-    if matrix is None or matrix.mat() is None or matrix.mat().shape != (3, 3):
+    k = np.zeros(0) if matrix is None else read_matrix(path, matrix)
+    if k.shape != (3, 3):
         raise InputError(f"{path}: has no 3 x 3 matrix {_MATRIX[0]} (or {', '.join(_MATRIX[1:])}).")
     if not storage.getNode("M2").empty():
         raise InputError(
             f"{path}: holds two cameras (M1 and M2 of a stereo pair). Save each in a file of its own, with the keys "
             f"{_MATRIX[0]} and {_LENS[0]}."
         )
-    k = np.array(matrix.mat(), dtype=float)
-    values = np.zeros(0) if lens is None else np.ravel(lens.mat()).astype(float)
+    if k[1, 0] or not np.array_equal(k[2], (0.0, 0.0, 1.0)):
+        raise InputError(
+            f"{path}: {matrix.name()} is to be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]], in px. MATLAB's is transposed."
+        )
+    values = np.zeros(0) if lens is None else np.ravel(read_matrix(path, lens))
     model = storage.getNode("distortion_model").string()
     is_fisheye = model in _FISHEYES or storage.getNode("fisheye_model").real() > 0.0  # flag of OpenCV's own program
     if not storage.getNode("xi").empty() or not (is_fisheye or model in _OPENCV):
@@ -107,20 +119,26 @@ def _pixel_camera(path: Path, storage: Any) -> PixelCamera:
         )
     family = "opencv_fisheye" if is_fisheye else "opencv"
     names = parameter_names(family)[:-2]  # b1 and b2 are part of the matrix
-    if values.size > len(names) or not (np.isfinite([*values, *k.ravel()]).all() and min(k[0, 0], k[1, 1]) > 0.0):
+    if not (np.isfinite([*values, *k.ravel()]).all() and min(k[0, 0], k[1, 1]) > 0.0):
+        raise InputError(f"{path}: camera matrix and distortion are to be finite, and its fx and fy positive.")
+    if values.size not in _COUNTS[family]:
+        counts = ", ".join(map(str, _COUNTS[family][1:]))
         raise InputError(
-            f"{path}: the camera matrix and up to {len(names)} distortion values are to be finite, and its fx and fy "
-            "positive."
+            f"{path}: {values.size} distortion coefficients; OpenCV has {counts}, in the order "
+            f"{', '.join(names[:5])}. Append zeros."
         )
+    size_px = None if size is None or height is None else (size.real(), height.real())
+    if size_px is not None and not all(0.0 < side <= _MOST_PX for side in size_px):
+        raise InputError(f"{path}: {_WIDTH[0]} and {_HEIGHT[0]} are to be the picture's sides in px.")
     covariance, count = storage.getNode(COVARIANCE), 4 + values.size
-    known = None if covariance.empty() else np.array(covariance.mat(), dtype=float)
+    known = None if covariance.empty() else read_matrix(path, covariance)
     if known is not None and (known.shape != (count, count) or not np.allclose(known, known.T, atol=0.0)):
         raise InputError(f"{path}: {COVARIANCE} is to be {count} x {count} and symmetric: see `reseau calibrate`.")
     return PixelCamera(
         (k[0, 0], k[1, 1], k[0, 2], k[1, 2]),
         family,
         dict(zip(names, values.tolist(), strict=False)) | {"b2": k[0, 1] / k[1, 1]},
-        None if size is None or height is None else (size.real(), height.real()),
+        size_px,
         known,
     )
 

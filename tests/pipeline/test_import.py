@@ -144,7 +144,7 @@ ENTITIES = '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]><a>&c
         ("micmac", "<a/>", "has no <MesureAppuiFlottant1Im>"),
         ("micmac", MARKS.format("1 x"), "should be 2 numbers"),
         ("micmac", MARKS.format("1 nan"), "should be 2 numbers"),
-        ("opencv", "%YAML:1.0\n---\nK: 5\n", "with a camera in it"),
+        ("opencv", "%YAML:1.0\n---\nK: 5\n", "K is no matrix"),
         ("opencv", "no yaml \x01 at all", "cv2.FileStorage"),
         ("metashape", "<calibration><width>10</width><height>9</height><f>-3</f></calibration>", "no positive f"),
         ("metashape", "<calibration><width>9</width><height>9</height><f>3</f><k4>1</k4></calibration>", "k4 is 1"),
@@ -159,6 +159,11 @@ ENTITIES = '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]><a>&c
         ("opencv", PIXELS.format(POSE.format(3, 3, "1, 0, 0, 0, 1, 0, 0, 0, -1", "1, 2, 3")), "is no rotation matrix"),
         ("opencv", PIXELS.format(POSE.format(3, 3, UNIT, "1, .Nan, 3")), "is no rotation matrix"),
         ("opencv", PIXELS.format("").replace("9, 5, 0", "-9, 5, 0"), "fx and fy positive"),
+        ("opencv", PIXELS.format("").replace("5, 0, 9, 5, 0, 0, 1", "0, 0, 9, 0, 5, 5, 1"), "is transposed"),
+        ("opencv", PIXELS.format("").replace("0, 0, 1]", "0, 0, 2]"), "[0, 0, 1]], in px"),
+        ("opencv", PIXELS.format("D: {rows: 1, cols: 6, data: [0, 0, 0, 0, 0, 1]}"), "6 distortion coefficients"),
+        ("opencv", PIXELS.format("D: {rows: 1, cols: 4, data: [0, x, 0, 0]}"), "D is no matrix"),
+        ("opencv", PIXELS.format('image_width: "10"\nimage_height: 9'), "sides in px"),
         ("colmap", "", "is no reconstruction"),
         ("certificate", CERTIFICATE.replace("7.5, 15.0", "1e-7, 2e-7"), "no curve can be fitted"),
         ("certificate", "radial_um = [1.0]", "calibrated principal distance"),
@@ -172,6 +177,30 @@ def test_wrong_files_are_refused(format: str, text: str, words: str, tmp_path: P
     assert command("import", format, file, tmp_path / "o", *PITCH, "--sigma-px", "1") == WRONG_INPUT
     assert words in capfd.readouterr().err
     assert not (tmp_path / "o").exists()
+
+
+def test_matrices_without_a_type_and_empty_ones_are_read(tmp_path: Path) -> None:
+    """ROS's camera info states no type; cv2.FileStorage writes a lens without distortion as an empty matrix."""
+    lens = "D: {rows: 1, cols: 5, data: [-0.1, 0.02, 0, 3e-4, 7]}"
+    (tmp_path / "ros.yaml").write_text(f"K: {{rows: 3, cols: 3, data: [9, 0, 5, 0, 8, 5, 0, 0, 1]}}\n{lens}\n")
+    camera = read_camera(imported("opencv", [tmp_path / "ros.yaml"], tmp_path, *PITCH) / "camera.toml")
+    values = {name: prior.value for name, prior in camera.distortion.parameters.items()}
+    assert values == {"b1": 0.125, "k1": -0.1, "k2": 0.02, "p2": 3e-4, "k3": 7.0}
+    (tmp_path / "none.yml").write_text(PIXELS.format("D: !!opencv-matrix {rows: 0, cols: 0, dt: d, data: []}"))
+    camera = read_camera(imported("opencv", [tmp_path / "none.yml"], tmp_path, *PITCH) / "camera.toml")
+    assert camera.distortion.family == "none"
+
+
+def test_images_of_a_camera_that_is_not_read_do_not_take_another(tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 100 100 50 50 50 50\n2 FOV 100 100 50 50 50 50 0.1\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 1 2 3 1 a.jpg\n\n2 1 0 0 0 1 2 3 2 b.jpg\n\n")
+    (tmp_path / "points3D.txt").write_text("")
+    assert command("import", "colmap", tmp_path, tmp_path / "out", *PITCH) == LOOK
+    assert "which is not read. Images without a camera: b." in " ".join(capsys.readouterr().out.split())
+    images = read_images(tmp_path / "out" / "images.csv")
+    assert Path(images.camera["a"]) == tmp_path / "out" / "camera1.toml"
+    assert "b" in images.exterior
+    assert not images.camera.get("b")
 
 
 def test_a_camera_that_is_not_read_ends_with_exit_code_1(tmp_path: Path, capsys: Capture) -> None:
