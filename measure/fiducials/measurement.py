@@ -46,6 +46,7 @@ _OBLIQUE = Reason(
 )
 _FRAME_SHIFT = 0.95  # fraction of the frame's size: a rival shifted by more is another photograph
 _AMBIGUOUS = 0.9  # fraction of the best score from which another placement is a rival
+_FREE = 2  # marks that a similarity fits wherever they lie
 _FEWER_FOUND = 0.5  # times the fraction of all marks found
 _PLAIN_PX = 3.0  # px across the finest line of a mark: both edges and the inside are resolved
 _ASSUMED = Reason(
@@ -123,12 +124,14 @@ def _search_frame(
         if pose.name != own:
             renamed = rename_frame(frame, pose.name)
             if renamed is frame:  # fewer marks agree under the new names: its own orientation is kept, only assumed
-                contrary = f"fewer marks agree in orientation {pose.name} than in {own}, which is assumed."
-                pose = replace(pose, name=own, decided=False, evidence=(*pose.evidence, contrary), rivals=())
+                fewer = f"fewer marks agree in orientation {pose.name} than in {own}, which is assumed."
+                pose = replace(pose, name=own, decided=False, evidence=(*pose.evidence, fewer), rivals=())
             frame = renamed
     else:
         if pose.name != own and frame.unblemished:
-            against = _against_the_set_pose(own, decide_scan_orientation(frame, lines or (), (own, pose.name)))
+            contrary = decide_scan_orientation(frame, lines or (), (own, pose.name))
+            if rename_frame(frame, contrary.name) is not frame:  # as many marks agree under the other names
+                against = _against_the_set_pose(own, contrary)
         pose = ScanOrientation(options.pose, True, _SET)
     doubt = found.doubt if is_faint or frame is found.frame else doubt_frame(result, frame)
     problems = [each.reword(f"{each}.") for each in (*_rivals(result, frame), doubt, against) if each]
@@ -212,7 +215,7 @@ def _rivals(result: SearchResult, frame: Frame) -> list[Reason]:
         as_good = other.score >= _AMBIGUOUS * best.score and (
             other.supported >= best.supported - 1 or _lacks_its_own(frame, other)
         )
-        if not (as_good or _is_another_frame(result, other, frame)):
+        if not ((as_good and not _outdoes(frame, other)) or _is_another_frame(result, other, frame)):
             continue
         linear, shifts = best.pixel_from_camera[:, :2], (each.pixel_from_camera[:, 2] for each in (other, best))
         shift = np.linalg.solve(linear, np.subtract(*shifts))
@@ -239,6 +242,14 @@ def _lacks_its_own(frame: Frame, rival: Placement) -> bool:
     apart_px, _ = cKDTree(rival.places_px(frame.camera_mm)).query(frame.predicted_px)
     own = frame.inside & (apart_px > frame.first_search_px)
     return bool(own.any() and found[own].mean() < _FEWER_FOUND * found[frame.inside].mean())
+
+
+def _outdoes(frame: Frame, rival: Placement) -> bool:
+    """Whether a frame has all marks that are found from a rival placement, and two or more besides."""
+    if rival.supported > len(frame.unblemished) - _FREE:
+        return False
+    frame_there = measure_frame(frame.scan, frame.layout, rival, frame.options)
+    return frame.contains(frame_there) and len(frame_there.unblemished) <= len(frame.unblemished) - _FREE
 
 
 def _is_another_frame(result: SearchResult, other: Placement, frame: Frame) -> bool:

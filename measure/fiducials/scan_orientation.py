@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from scipy import ndimage
+from scipy.special import gammaln
 
 from measure.annotations.lines import Line, is_of_film, is_plate, signs
 from measure.array_types import Array, Mask
@@ -175,8 +176,15 @@ def _name_sites(frame: Frame, pose: str, fits: Sequence[MarkFit], missed: Array)
     sigma = np.sqrt(np.array(given) ** 2 + measured**2 + options.film_sigma_mm**2)
     up = frame.up_mm(centers[: len(fits)][found])
     fit = fit_frame(frame.camera_mm[own], up, sigma, UP_FROM_CAMERA[pose], options.film_model)
-    degrees = SCATTER_DEGREES + max(fit.redundancy, 0)
+    redundancy = max(fit.redundancy, 0)
+    degrees = SCATTER_DEGREES + redundancy
     coordinates = -degrees / 2 * float(np.log1p(fit.chi_square / SCATTER_DEGREES))
+    # Orientations that name fewer marks explain fewer coordinates: a mark without a name may lie anywhere in the gate.
+    # That it looks like a mark is counted with the pictures.
+    coordinates += float(
+        gammaln(degrees / 2) - redundancy / 2 * np.log(np.pi * SCATTER_DEGREES) - 2 * np.log(sigma).sum()
+    )
+    coordinates -= (len(fits) - len(own)) * float(np.log(np.pi * (_NAMED * options.gate_mm) ** 2))
     return replace(hypothesis, coordinates=coordinates, chi_square=fit.chi_square)
 
 

@@ -65,8 +65,9 @@ Evaluated = tuple[float, Frame]  # expected number of false frames as good
 
 _TRIALS = 4  # placements tried at full resolution after the best one
 _NOTHING = Reason("no two of the camera's marks were found in the scan", Code.NO_FRAME)
-_LEAST_GAINED = 3  # marks: one more than the two additional parameters of a perspective may fit by chance
-_MISSED_SHARE = 0.3  # fraction of the marks that an affine transformation misses if a perspective makes it miss any
+_LEAST_GAINED = 2  # marks: the two additional parameters of a perspective may fit one wherever it lies
+_MISSED_SHARE = 0.25  # fraction of the marks that an affine transformation misses if a perspective makes it miss any
+_MISSED = 2  # marks at most that may be missed under a perspective, and as many more at reduced resolution
 _OBLIQUE = 6  # marks needed to prove a perspective: any four fit one, and two more check it
 _SLIGHT = (-0.005, 0.005, -0.01, 0.01)  # relative stretches for faint marks, searched within narrow bounds only
 _STRETCH = 3 * AFFINITY_SIGMA  # relative error of a given pitch, where marks are too faint to correct it
@@ -119,9 +120,10 @@ class Stage:
             return best is not None and best.accepted and len(best.clear_fits) == len(best.inliers) >= CHECKED
         if self.kind == "oblique":
             # Weak marks do not count as missing: a perspective displaces marks, but leaves their quality unchanged.
-            return frame is not None and frame.inside_count - len(frame.inlier_fits) < max(
-                _LEAST_GAINED, _MISSED_SHARE * frame.inside_count
-            )
+            if frame is None:
+                return False
+            shown = frame.inside_count if self.options.part else len(frame.detections)
+            return shown - len(frame.inlier_fits) < max(_LEAST_GAINED, _MISSED_SHARE * shown)
         return self.kind == "pitch" and found.is_taken and not found.doubt
 
 
@@ -200,6 +202,9 @@ def find_frame(
         tried = hypotheses_at_given_pitch if stage.at_given else hypotheses_so_far
         start = scan if stage.tone is None else scan.replace_tone(stage.tone)
         frames = measure_stage(start, layout, stage, result, tried)
+        if stage.kind == "oblique" and found.is_taken and found.frame:
+            least = len(found.frame.inlier_fits) + _LEAST_GAINED
+            frames = [each for each in frames if len(each[1].unblemished) >= least]
         expected, frame = frames[0] if frames else (np.inf, None)
         if expected <= MAX_FALSE_FRAMES:
             found = replace(found, result=result, frame=frame, is_taken=True)
@@ -236,23 +241,23 @@ def measure_stage(
     """
     kind, options, found = stage.kind, stage.options, result.placements
     # The best placement, then others elsewhere by score times supporting marks: a few high peaks alone are often false.
-    others = [] if kind in ("middle", "oblique") else sorted(found[1:], key=lambda each: -each.score * each.supported)
+    others = [] if kind == "middle" else sorted(found[1:], key=lambda each: -each.score * each.supported)
     places = distinct_places((*found[:1], *others), _TRIALS + 1)
     if kind in ("pitch", "faint"):
         number = tried if kind == "faint" else len(stage.hypotheses)
         places = [each for each in places if number * false_placements(result, each) <= MAX_FALSE_PLACEMENTS]
     if kind == "pitch" or stage.tone is not None:
         places = [each for each in places if shows_marks(scan, layout, each, options)]
-    least = _OBLIQUE, _LEAST_GAINED - 1  # marks in all, and missing ones, for a perspective
     if kind == "oblique":
-        places = [each for each in places if each.supported >= max(least[0], len(layout.marks) - least[1])]
+        needed = max(_OBLIQUE, len(layout.marks) - _MISSED)
+        places = [each for each in places if each.supported >= needed - _MISSED]
     measured = (measure_frame(scan, layout, each, options) for each in places)
     if stage.is_given:
         frame = best_frame(measured, max((each.supported for each in places), default=0), result)
         return [] if frame is None else [(0.0 if frame.accepted else np.inf, frame)]
     if kind == "oblique":
         frames = (frame for frame in measured if frame.accepted)
-        frames = (frame for frame in frames if len(frame.unblemished) >= max(least[0], frame.inside_count - least[1]))
+        frames = (frame for frame in frames if len(frame.unblemished) >= max(_OBLIQUE, frame.inside_count - _MISSED))
         evaluated = [(tried * false_frames(result, frame, frame.unblemished), frame) for frame in frames]
     else:
         evaluated = [each for frame in measured if (each := _evaluate(frame, result, tried))]

@@ -263,12 +263,19 @@ PLACES = {f"{x}{y}": (106.0 * x, 106.0 * y) for x in (-1, 0, 1) for y in (-1, 0,
 RADIUS_MM, OBLIQUE_FILM_PITCH_UM, FRAME_MM = 1.5, 200.0, (228.0, 228.0)
 
 
-@pytest.mark.parametrize(("model", "tilt_deg"), [("affine", 6.5), ("projective", 10.0)])
+EIGHT, SIX = tuple(PLACES), tuple(name for name in PLACES if name not in ("-10", "10"))
+
+
+@pytest.mark.parametrize(
+    ("model", "tilt_deg", "names"),
+    [("affine", 2.0, SIX), ("affine", 6.5, SIX), ("affine", 6.5, EIGHT), ("projective", 10.0, EIGHT)],
+)
 def test_balls_under_a_perspective_are_found_and_the_perspective_is_named(
-    tmp_path: Path, model: str, tilt_deg: float
+    tmp_path: Path, model: str, tilt_deg: float, names: tuple[str, ...]
 ) -> None:
-    ball = scenes.DrawnMark((disk((0.0, 0.0), RADIUS_MM),))
-    fiducials = tuple(scenes.SceneFiducial(*one, ball) for one in PLACES.items())
+    """A slight one leaves all marks near an affinity, and is no evidence on how the film lies in the scanner."""
+    ball, places = scenes.DrawnMark((disk((0.0, 0.0), RADIUS_MM),)), {name: PLACES[name] for name in names}
+    fiducials = tuple(scenes.SceneFiducial(*one, ball) for one in places.items())
     camera = scenes.SceneCamera("film", FRAME_MM, 150.0, fiducials=fiducials)
     film = scenes.SceneFilm("projective", tilt_deg=tilt_deg, tilt_direction_deg=5.0)
     scanner = scenes.SceneScanner((OBLIQUE_FILM_PITCH_UM, OBLIQUE_FILM_PITCH_UM), margin_mm=6.0, noise=0.01)
@@ -276,14 +283,14 @@ def test_balls_under_a_perspective_are_found_and_the_perspective_is_named(
     scene = scenes.Scene("film", 1, camera, hidden_field(), (image,), scanner, film, scenes.Tones(contrast=0.0))
     (truth,) = render_scene(scene, tmp_path).frames
     shape = MarkShape((Disk((0.0, 0.0), RADIUS_MM),), "light")
-    layout = FiducialLayout(tuple(LayoutMark(k, xy, (0.002, 0.002), shape) for k, xy in PLACES.items()), FRAME_MM)
+    layout = FiducialLayout(tuple(LayoutMark(k, xy, (0.002, 0.002), shape) for k, xy in places.items()), FRAME_MM)
     with open_scan(tmp_path / "scans" / "f.tif") as scan:
         options, pitch_um = FiducialOptions("0", film_model=model), (OBLIQUE_FILM_PITCH_UM, OBLIQUE_FILM_PITCH_UM)
         frame = measure_fiducials(scan.replace_tone(LINEAR), layout, pitch_um, options)
     assert {mark.status for mark in frame.marks} == {Status.MEASURED}
     for mark in frame.marks:
         assert np.abs(center(mark) - truth.fiducials[mark.point].center_px).max() < 0.05
-    if model == "projective":
+    if model == "projective" or tilt_deg == 2.0:
         assert frame.problems == ()
     else:
         (problem,) = (each for each in frame.problems if Code.PERSPECTIVE in each.codes)
