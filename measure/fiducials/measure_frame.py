@@ -360,17 +360,22 @@ def may_be_wrong(covariance_px2: Array) -> bool:
     return bool(chdtrc(2, (_WRONG_PX / largest_sigma_px(covariance_px2)) ** 2) > LARGE_ERROR)
 
 
-def measure_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
-    """Measure a frame from its placement."""
-    frame = detect_frame(scan, layout, placement, options)
+def measure_frame(
+    scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions, begun: Frame | None = None
+) -> Frame:
+    """Measure a frame from its placement. begun: the frame with some of its marks detected, of `detect_some`."""
+    frame = detect_frame(scan, layout, placement, options, begun)
     # A sharpening that is known by then is not estimated again: amount and radius trade off, and the marks hardly move.
     return refit_frame(frame if frame.scan.tone.sharpening.is_determined else fit_lines_and_sharpening(frame))
 
 
-def detect_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:
-    """Detect the marks of a frame, clear and faint ones, without the refit."""
-    frame = start_frame(scan, layout, placement, options)
-    clear = orient_frame(_detect(frame, range(len(layout.marks)), frame.first_search_px))
+def detect_frame(
+    scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions, begun: Frame | None = None
+) -> Frame:
+    """Detect the marks of a frame, clear and faint ones, without the refit. begun: as for `measure_frame`."""
+    frame = begun or start_frame(scan, layout, placement, options)
+    pending = [index for index, each in enumerate(frame.detections) if not (each.inside or each.reason)]
+    clear = orient_frame(_detect(frame, pending, frame.first_search_px))
     return detect_missing_marks(fit_lines_and_sharpening(clear, _FEWEST_SHARPENED))
 
 
@@ -908,11 +913,14 @@ def _fit_again(frame: Frame, index: int, options: MatchOptions, linear_sigma: fl
     return detect_mark(frame.scan, expected, options, linear_sigma, begun).fit
 
 
-def shows_marks(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> bool:
-    """Whether any of some marks, spread over the frame, is clear in a placement."""
+def detect_some(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame | None:
+    """Start a frame and detect marks spread over it, up to the first clear one; None if none of them is clear."""
     frame = start_frame(scan, layout, placement, options)
-    some = range(0, len(layout.marks), max(1, len(layout.marks) // _TRIALS))
-    return any(_detect(frame, [index], frame.first_search_px).detections[index].is_clear for index in some)
+    for index in range(0, len(layout.marks), max(1, len(layout.marks) // _TRIALS)):
+        frame = _detect(frame, [index], frame.first_search_px)
+        if frame.detections[index].is_clear:
+            return frame
+    return None
 
 
 def rename_frame(frame: Frame, pose: str) -> Frame:

@@ -28,10 +28,10 @@ from measure.fiducials.measure_frame import (
     RANDOM_PLACES,
     REDUCED_PX,
     Frame,
+    detect_some,
     measure_frame,
     random_matches,
     rename_frame,
-    shows_marks,
 )
 from measure.fiducials.options import FiducialOptions
 from measure.fiducials.scan_orientation import decide_scan_orientation
@@ -240,6 +240,7 @@ def measure_stage(
     Placements under another tone curve or pitch are measured only if some marks are clear there.
     """
     kind, options, found = stage.kind, stage.options, result.placements
+    begun = dict[Placement, Frame]()
     # The best placement, then others elsewhere by score times supporting marks: a few high peaks alone are often false.
     others = [] if kind == "middle" else sorted(found[1:], key=lambda each: -each.score * each.supported)
     places = distinct_places((*found[:1], *others), _TRIALS + 1)
@@ -247,11 +248,12 @@ def measure_stage(
         number = tried if kind == "faint" else len(stage.hypotheses)
         places = [each for each in places if number * false_placements(result, each) <= MAX_FALSE_PLACEMENTS]
     if kind == "pitch" or stage.tone is not None:
-        places = [each for each in places if shows_marks(scan, layout, each, options)]
+        begun = {each: frame for each in places if (frame := detect_some(scan, layout, each, options))}
+        places = list(begun)
     if kind == "oblique":
         needed = max(_OBLIQUE, len(layout.marks) - _MISSED)
         places = [each for each in places if each.supported >= needed - _MISSED]
-    measured = (measure_frame(scan, layout, each, options) for each in places)
+    measured = (measure_frame(scan, layout, each, options, begun.get(each)) for each in places)
     if stage.is_given:
         frame = best_frame(measured, max((each.supported for each in places), default=0), result)
         return [] if frame is None else [(0.0 if frame.accepted else np.inf, frame)]

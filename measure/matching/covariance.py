@@ -81,10 +81,9 @@ class LinearFit:
         """(2, 2) covariance of the place due to model misfit: correlated residuals at the mark's edges in excess of the
         noise. by_noise (2, 2) px2: covariance due to noise."""
         place, left = self.by_grey[:2], np.where(self.used, self.residuals, 0.0)[None]
-        expected = self.covariance(place)
         if self.noise.is_grain:  # whiten, so that neighbours are uncorrelated under the null hypothesis
             place, left = correlate(place, self.noise, 0.5), correlate(left, self.noise, -0.5)
-            expected = inner_products(place, place)
+        expected = inner_products(place, place) if self.noise.is_grain else self.covariance(place)
         shares = place * left
         about = _smooth(shares, _ALIKE_PX) * (2 * np.pi * _ALIKE_PX**2)
         more = inner_products(about, shares) - expected

@@ -212,13 +212,13 @@ class PictureModel:
         moving = [*slopes, *combine(self.generators.reshape(-1, 4).astype(np.float32), moves)]
         if self.blur is not None:
             moving.append(-0.5 * shown.laplacian)
-        columns[:] = [self.detail(image) for image in moving]
-        columns *= -self.state.greys[0]
+        for column, image in zip(columns, moving, strict=True):
+            np.multiply(self.detail(image), -self.state.greys[0], out=column)
         self.residuals = self.grey - combine(self.state.greys, greys)
         if isinstance(self.mark, MarkTemplate):
             self.steadiness = chip_steadiness(self.mark, place, width, height)
             self.half_tones = self.steadiness * self.state.greys[0] * self.detail(4 * shown.value * (1 - shown.value))
-        for each in (self.residuals, self.design):
+        for each in (self.residuals, self.design) if (self.steadiness != 1).any() else ():
             each *= self.steadiness
         if self.is_clipped:
             self._censor()

@@ -215,11 +215,14 @@ def tag_pitch(page: TiffPage) -> Pitch:
 
 
 def grey_or_colour(picture: NDArray[Any]) -> Samples:
-    """One or three channels of a decoded image, without transparency. Raises one of DECODING_ERRORS."""
+    """One or three channels of a decoded image, without transparency; one if all are equal, as of a grey scan that was
+    stored as colour. Raises one of DECODING_ERRORS."""
     if picture.size == 0:
         raise ValueError("it holds no picture")
     stored = picture[..., None] if picture.ndim == 2 else picture
     channels = {1: 1, 2: 1, 3: 3, 4: 3}[stored.shape[2]]
+    if all(np.array_equal(stored[..., 0], stored[..., channel]) for channel in range(1, channels)):
+        channels = 1
     return Radiometry(channels, float(np.iinfo(stored.dtype).max)).apply(stored)
 
 

@@ -13,10 +13,11 @@ from adjust.functional_model.transformation import FILM_NAMES, HIGHEST_ORDER, fi
 from measure import FiducialOptions, Scan, Status
 from measure.detection.responses import ByteCache, Responses
 from measure.fiducials import consistency, stages
+from measure.fiducials import measure_frame as steps
 from measure.fiducials.across_frames import check_frames
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, same_picture
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA, FrameFit, film_terms, fit_frame
-from measure.fiducials.measure_frame import Frame, fit_lines_and_sharpening, measure_frame
+from measure.fiducials.measure_frame import Frame, detect_frame, detect_some, fit_lines_and_sharpening, measure_frame
 from measure.fiducials.measurement import _lacks_its_own, present_frame
 from measure.fiducials.scan_checks import pitch_problem
 from measure.fiducials.scan_orientation import DISTURBANCE_P, MarkSite, OrientedMark, decide_scan_orientation
@@ -296,6 +297,24 @@ def centers_px(layout: FiducialLayout, pose: str) -> Array:
 
 def make_frame_chance(scan: Scan, layout: FiducialLayout) -> Frame:
     return measure_frame(scan, layout, placement("0"), OPTIONS)
+
+
+def test_marks_by_which_a_placement_was_tried_are_not_detected_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    scan, sought = make_scan(picture(DOTS, "0", hidden=0)), list[list[int]]()
+    begun = detect_some(scan, DOTS, placement("0"), OPTIONS)
+    assert begun is not None
+    assert [each.inside for each in begun.detections] == [True, True, False, False]  # up to the first clear one
+
+    def record(frame: Frame, indices: Sequence[int], _: float) -> Frame:
+        sought.append(list(indices))
+        return frame
+
+    monkeypatch.setattr(steps, "_detect", record)
+    monkeypatch.setattr(steps, "detect_missing_marks", lambda each: each)
+    frame = detect_frame(scan, DOTS, placement("0"), OPTIONS, begun)
+    assert sought == [[2, 3]]
+    assert np.hypot(*(frame.inlier_fits[1].center_px - centers_px(DOTS, "0")[1])) < 0.2
+    assert detect_some(make_scan(noisy(np.full((380, 380), 20000.0))), DOTS, placement("0"), OPTIONS) is None
 
 
 def test_three_plain_dots_of_four_are_no_chance() -> None:
@@ -602,7 +621,7 @@ def test_under_another_pitch_the_marks_together_decide_on_a_frame(monkeypatch: p
     frame.placement = Placement("0", np.eye(2, 3), 1.0, 3, 1, 1, (0.05, 0.05))
     for function, value in (("measure_frame", frame), ("false_placements", 1e-4), ("false_frames", 0.5)):
         monkeypatch.setattr(stages, function, lambda *_, value=value: value)
-    monkeypatch.setattr(stages, "shows_marks", lambda *_: True)
+    monkeypatch.setattr(stages, "detect_some", lambda *_: frame)
     stage = Stage("pitch", [GIVEN], FiducialOptions())
     ((expected, found),) = stages.measure_stage(SCAN, ALIKE, stage, SearchResult((frame.placement,)), 5)
     assert found is frame

@@ -120,6 +120,22 @@ def test_trap_palette_read_as_grey(tmp_path: Path) -> None:
     np.testing.assert_array_equal(whole(tmp_path / "s.tif"), (255.0 - indices) * 257)
 
 
+@pytest.mark.parametrize("ending", [".png", ".jpg"])
+def test_equal_channels_are_one(tmp_path: Path, ending: str) -> None:
+    """A picture with one blue pixel of another grey value has three."""
+    grey = picture(np.uint8)
+    (tmp_path / f"s{ending}").write_bytes(cv2.imencode(ending, np.dstack([grey] * 3))[1].tobytes())
+    expected = np.asarray(PIL.Image.open(tmp_path / f"s{ending}"))[..., 1]
+    with open_scan(tmp_path / f"s{ending}") as scan:
+        assert scan.channels == 1
+        np.testing.assert_array_equal(scan.window(0, 0, WIDTH, HEIGHT), expected)
+    spotted = np.dstack([grey] * 3)
+    spotted[-1, -1, 0] ^= 255
+    cv2.imwrite(str(tmp_path / "spotted.png"), spotted)
+    with open_scan(tmp_path / "spotted.png") as scan:
+        assert scan.channels == 3
+
+
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("extra", ["unassalpha", "assocalpha", "unspecified", "png"])
 def test_trap_alpha_taken_for_light(tmp_path: Path, channels: int, extra: str) -> None:
