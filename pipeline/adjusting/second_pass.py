@@ -132,4 +132,9 @@ def _add_targets(
     model = adjusted_image(adjustment, scan.frame.image)
     checked = checked_places(tuple((targets | fresh).values()), field, model, scan)
     fresh = {mark.point: mark for mark in checked if mark.point in fresh and mark.status.is_observation}
-    return replace_targets(scan, tuple((targets | fresh).values())) if fresh else scan
+    if not fresh:
+        return scan
+    if not taken:  # the adjustment names what the scan by itself did not
+        problems = tuple(each for each in scan.frame.problems if Code.UNNAMED not in each.codes)
+        scan = replace(scan, frame=replace(scan.frame, problems=problems))
+    return replace_targets(scan, tuple((targets | fresh).values()))

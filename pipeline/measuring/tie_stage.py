@@ -107,18 +107,26 @@ def _check_fiducials_by_joins(scans: Sequence[MeasuredScan]) -> list[MeasuredSca
         elif 0 < len(_fiducials(scan)) < _CHECKED:
             few = Reason("so few fiducials fit many frames, and no other part of this one checks them", Code.NO_CHECK)
             result[image] = scan.change_status("fiducial", Status.WEAK, few)
-    # Fiducials outside of a scan that another partial scan shows are not missing.
     shown = {point: image for image, scan in reversed(result.items()) for point in _fiducials(scan)}
-    agreed = []
-    for scan in result.values():
-        marks = [
-            replace(mark, reason=Reason(f"it lies in {shown[mark.point]}, another scan of its frame", Code.OTHER_PART))
-            if mark.kind == "fiducial" and Code.OUTSIDE in mark.reason.codes and mark.point in shown
-            else mark
-            for mark in scan.frame.marks
-        ]
-        agreed.append(scan.changed(marks))
-    return agreed
+    return [_excuse_fiducials(scan, shown) for scan in result.values()]
+
+
+def _excuse_fiducials(scan: MeasuredScan, shown: Mapping[str, str]) -> MeasuredScan:
+    """Scan in which fiducials are not missing that lie outside of it and in another one of its frame; nor is any where
+    a joined scan shows none of them, as the middle one of three. shown: the other scan, by fiducial."""
+    marks = scan.frame.marks
+    is_without = scan.frame.pixel_from_camera is None and any(
+        mark.kind == "join" and mark.status.is_observation for mark in marks
+    )
+    is_without &= shown.keys() >= {mark.point for mark in marks if mark.kind == "fiducial"}
+    marks = tuple(
+        replace(mark, reason=Reason(f"it lies in {shown[mark.point]}, another scan of its frame", Code.OTHER_PART))
+        if mark.kind == "fiducial" and mark.point in shown and (is_without or Code.OUTSIDE in mark.reason.codes)
+        else mark
+        for mark in marks
+    )
+    problems = tuple(each for each in scan.frame.problems if not (is_without and Code.NO_FRAME in each.codes))
+    return replace(scan, frame=replace(scan.frame, marks=marks, problems=problems))
 
 
 def _fiducials(scan: MeasuredScan) -> dict[str, Array]:

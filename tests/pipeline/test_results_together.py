@@ -35,7 +35,9 @@ from projects import (
 from test_command_line import results, rewritten_scans
 
 from adjust import Prior
-from measure import Status
+from measure import MarkMeasurement, Status
+from measure.flags import Code, Reason
+from measure.results import Covariance, FrameMeasurement
 from pipeline import read_measurement, read_project, stages
 from pipeline.adjusting import second_pass
 from pipeline.archive.made_from import measured_from
@@ -270,6 +272,21 @@ def test_an_ended_second_pass_costs_no_other(project: Path, capsys: Capture, mon
     assert [one["what"].split(":")[0] for one in problems] == ["frame2"]
     assert "its process was ended" in problems[0]["what"]
     assert {visit.image for visit in requests if isinstance(visit, second_pass.RepeatedSearch)} > {"frame1", "frame2"}
+
+
+def test_targets_of_a_second_pass_answer_why_none_had_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(second_pass, "adjusted_image", Mock())
+    monkeypatch.setattr(second_pass, "checked_places", lambda marks, *_: marks)
+    problems = (Reason("No target has a name: no pattern.", Code.UNNAMED), Reason("It is blurred.", Code.SMALL))
+    found, other = (
+        MarkMeasurement(id, "target", np.full(2, col), Covariance.from_noise(np.eye(2)), Status.MEASURED)
+        for id, col in (("1", 9.0), ("2", 50.0))
+    )
+    for marks, left in (((), problems[1:]), ((other,), problems)):
+        scan = MeasuredScan("a.tif", 100, 100, (20.0, 20.0), FrameMeasurement("a", marks, problems=problems))
+        again = second_pass._add_targets(scan, [found], Mock(), Mock())
+        assert again.frame.problems == left
+        assert found in again.frame.marks
 
 
 def test_a_place_that_is_held_is_named(project: Path, refusal: Refusal, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,18 +18,22 @@ from adjust import ObjectPoint
 from adjust.functional_model.lens import Distortion as OtherDistortion
 from adjust.functional_model.lens import Prior
 from adjust.functional_model.transformation import Film as OtherFilm
-from measure import Status
+from measure import MarkMeasurement, Status
+from measure.flags import Code, Reason
+from measure.results import Covariance, FrameMeasurement
 from measure.tie_points.features import TieFrame
 from measure.tie_points.find_points import TieOptions, measure_ties
 from measure.tie_points.joins import measure_joins
 from pipeline import InputError, build_network, read_images, read_measurement, read_project
+from pipeline.archive.verdicts import Verdict, scan_verdict
 from pipeline.blocks import block_stage
 from pipeline.exchange.incoming import fiducial_camera
 from pipeline.files.camera_file import CameraFile
-from pipeline.measuring.tie_stage import add_joins, check_tie_names
+from pipeline.measuring.tie_stage import _check_fiducials_by_joins, add_joins, check_tie_names
 from pipeline.resampling.canvas import FrameChain
 from pipeline.resampling.resample_stage import FAST, FrameScan, ResampleTask, resample_frame
 from pipeline.results.comparator_file import ComparatorPoint, read_comparator, write_comparator
+from pipeline.results.measured_record import MeasuredScan
 from synthetic_images.render import render_scene
 from synthetic_images.scene import DiskField, Scene, SceneCamera, SceneDistortion, SceneFilm, SceneImage, SceneScanner
 from synthetic_images.terrain import transferred
@@ -475,6 +479,29 @@ def test_fiducials_that_contradict_the_joins_are_rejected(halves: Path) -> None:
     result = add_joins(project, scans, lambda *_: None, None)
     assert all("contradict those of" in " ".join(scan.frame.problems) for scan in result)
     assert not any(mark.kind == "fiducial" and mark.status.is_observation for mark in result[1].frame.marks)
+
+
+def strip(name: str, own: str, joins: str) -> MeasuredScan:
+    """One of several scans of a frame, with some of the fiducials 1 to 4, its frame if it has any, and joins."""
+    lost = Reason("not found", Code.OUTSIDE if own else Code.NO_FRAME)
+    noise = Covariance.from_noise(np.eye(2))
+    shown = (MarkMeasurement(id, "fiducial", np.full(2, 9.0), noise, Status.MEASURED) for id in own)
+    absent = (MarkMeasurement(id, "fiducial", None, None, Status.ABSENT, lost) for id in sorted(set("1234") - set(own)))
+    places = (MarkMeasurement(id, "join", np.full(2, 5.0), noise, Status.MEASURED) for id in joins)
+    problems = () if own else (Reason("no fiducial was measured", Code.NO_FRAME),)
+    frame = FrameMeasurement(name, (*shown, *absent, *places), None, np.eye(2, 3) if own else None, problems)
+    return MeasuredScan(f"{name}.tif", 100, 100, (20.0, 20.0), frame)
+
+
+def test_a_middle_scan_misses_no_fiducials_that_the_others_show() -> None:
+    _, middle, _ = _check_fiducials_by_joins([strip("a", "12", "p"), strip("b", "", "pq"), strip("c", "34", "q")])
+    assert not middle.frame.problems
+    assert all(mark.reason.codes == (Code.OTHER_PART,) for mark in middle.frame.marks if mark.kind == "fiducial")
+    assert scan_verdict(middle) is Verdict.GOOD
+    for left, own in ((strip("a", "1", "p"), "pq"), (strip("a", "12", "p"), "")):  # a mark in none, or nothing joined
+        _, middle, _ = _check_fiducials_by_joins([left, strip("b", "", own), strip("c", "34", "q")])
+        assert [each.codes for each in middle.frame.problems] == [(Code.NO_FRAME,)]
+        assert scan_verdict(middle) is Verdict.POOR
 
 
 def test_one_part_tells_the_orientation_of_all(tmp_path: Path) -> None:
