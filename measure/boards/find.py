@@ -7,6 +7,7 @@ from itertools import islice
 
 import cv2
 import numpy as np
+from scipy.special import comb
 
 from measure.array_types import Array, Bytes, Integers
 from measure.boards.lattice import find_squares
@@ -25,6 +26,7 @@ from measure.scans.scan import Scan
 from measure.targets.sheets import fit_view_robustly
 
 _UNEVEN = 0.25  # in squares, largest median deviation of a line from a regular grid; next to a skipped line it is 0.5
+_SMOOTH = 4  # corners of a line through which the cubic is laid that predicts another
 _TRUSTED = 0.1  # in squares, largest deviation of any corner accepted from OpenCV's older detector
 _REFINED, _REFINING_END = 0.3, (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)  # in squares; px
 _INTO_SQUARE = 0.3  # in squares from the corner, where a square's grey value is sampled
@@ -63,7 +65,8 @@ class WholePattern:
 
 
 def is_even(grid: Array, size_px: tuple[int, int], farthest: float = np.inf) -> bool:
-    """Whether corners (rows, columns, 2) form a regular grid under one homography and radial distortion.
+    """Whether corners (rows, columns, 2) form a regular grid under one homography and radial distortion; or, since a
+    fisheye shows boards up to and beyond 90 degrees from its axis, by their neighbours.
 
     The lines are tested by their medians, so single misplaced corners are tolerated. farthest: largest deviation of any
     corner, in steps.
@@ -75,11 +78,20 @@ def is_even(grid: Array, size_px: tuple[int, int], farthest: float = np.inf) -> 
         off = cv2.perspectiveTransform(places[:, None], plane).reshape(grid.shape) - grid
         if (np.linalg.norm(off, axis=2) < _TRUSTED * steps).all():
             return True
-    view = fit_view_robustly(places, grid.reshape(-1, 2), size_px)
-    if view is None:
-        return False
-    off = np.hypot(*(view.places_px(places) - grid.reshape(-1, 2)).T).reshape(rows, columns) / steps
-    return off.max() < farthest and all(np.median(line) < _UNEVEN for line in (*off, *off.T))
+    offs, view = [], fit_view_robustly(places, grid.reshape(-1, 2), size_px)
+    if view is not None:
+        offs.append(np.hypot(*(view.places_px(places) - grid.reshape(-1, 2)).T).reshape(rows, columns) / steps)
+    if min(rows, columns) > _SMOOTH:
+        offs.append(np.maximum(_from_neighbours(grid), _from_neighbours(grid.swapaxes(0, 1)).T) / steps)
+    return any(off.max() < farthest and all(np.median(line) < _UNEVEN for line in (*off, *off.T)) for off in offs)
+
+
+def _from_neighbours(grid: Array) -> Array:
+    """(rows, columns) distance of each corner from the cubic through the four nearest others of its column, px."""
+    differences = np.linalg.norm(np.diff(grid, _SMOOTH, axis=0), axis=2)
+    row = np.arange(len(grid))
+    first = np.clip(row - _SMOOTH // 2, 0, len(differences) - 1)
+    return np.asarray(differences[first] / comb(_SMOOTH, row - first)[:, None])
 
 
 def whole_pattern(picture: Bytes, grid: Array) -> WholePattern | None:

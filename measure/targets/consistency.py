@@ -368,11 +368,12 @@ def predict_sheet_points(pictures: Sequence[SheetImage], sheet: Array) -> list[I
 
 def _predict_points(picture: SheetImage, view: SheetView, focal: float, sheet: Array) -> ImagePoints | None:
     """Predicted places and derivatives of an image's points; points that the view cannot project are left out."""
-    known = np.isfinite(view.places_px(sheet[picture.index, :2])).all(axis=1)
+    by_point = view.pixel_from_space(sheet[picture.index, :2], focal, _STEP * float(np.ptp(sheet[:, :2])))
+    # Beside the last point that the view can project its derivatives may not exist.
+    known = np.isfinite(view.places_px(sheet[picture.index, :2])).all(axis=1) & np.isfinite(by_point).all(axis=(1, 2))
     if known.sum() < _LEAST_POINTS:
         return None
-    points, count = sheet[picture.index[known]], int(known.sum())
-    by_point = view.pixel_from_space(points[:, :2], focal, _STEP * float(np.ptp(sheet[:, :2])))
+    points, by_point, count = sheet[picture.index[known]], by_point[known], int(known.sum())
     places = view.places_px(points[:, :2]) + by_point[..., 2] * points[:, 2:]
     # Shifts by one standard deviation of perspective and of decentring distortion.
     size = float(np.hypot(*picture.size_px))

@@ -14,6 +14,7 @@ from measure.noise.robust_estimation import robust_scale
 
 _RADIAL_FROM, _SECOND_RADIAL_FROM = 10, 30  # points needed to estimate k1, and k2
 _LARGEST_RADIAL = 3.0  # at the image corner, relative; a fisheye has up to 1.5
+_INVERTING = 25  # rounds that invert the distortion
 _SETTLING = 5  # rounds of outlier rejection and refit
 _FAR = 4.0  # in median distances: a point farther off is an outlier
 _LEAST_FAR_PX = 1.0  # lower bound of that distance
@@ -56,11 +57,14 @@ class SheetView:
     def places_px(self, sheet: Array) -> Array:
         """(n, 2) pixels of points of the sheet; nan behind the camera, or where the distortion is not invertible."""
         ideal = self.ideal(sheet)
-        place = ideal.copy()
-        for _ in range(25):
-            r2 = (place**2).sum(axis=1, keepdims=True)
+        radius = np.hypot(*ideal.T)
+        distorted = radius.copy()
+        for _ in range(_INVERTING):  # Newton: iterated division diverges in a fisheye, whose radii grow as r³ and more
             with np.errstate(all="ignore"):
-                place = ideal / np.maximum(1.0 + self.radial[0] * r2 + self.radial[1] * r2**2, 0.3)
+                r2 = distorted**2
+                off = distorted * (1.0 + self.radial[0] * r2 + self.radial[1] * r2**2) - radius
+                distorted -= off / np.maximum(1.0 + 3.0 * self.radial[0] * r2 + 5.0 * self.radial[1] * r2**2, 0.1)
+        place = ideal * (distorted / np.maximum(radius, 1e-12))[:, None]
         places = place * self._unit + self._middle
         unsettled = np.hypot(*(self.undistorted(places) - ideal).T) > 1e-3
         return np.where(unsettled[:, None], np.nan, places)

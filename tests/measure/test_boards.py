@@ -273,6 +273,20 @@ def test_lines_of_a_board_are_evenly_spaced_under_one_homography(left_out: int |
     assert is_even(grid, (640, 480)) == (left_out is None)
 
 
+@pytest.mark.parametrize("left_out", [None, 1, 3])
+@pytest.mark.parametrize("off_axis_deg", [50.0, 80.0])
+def test_lines_of_a_board_are_evenly_spaced_in_a_fisheye(off_axis_deg: float, left_out: int | None) -> None:
+    """Equidistant, r = f theta, of a board that reaches to 80 and to 105 degrees from the axis."""
+    column, row = np.meshgrid(np.arange(9.0) - 4.0, np.arange(7.0) - 3.0)
+    angle = np.deg2rad(off_axis_deg)
+    x, y, z = 6.0 * np.sin(angle) + column * np.cos(angle), row, 6.0 * np.cos(angle) - column * np.sin(angle)
+    away = np.arctan2(np.hypot(x, y), z) / np.hypot(x, y)
+    grid = np.stack([400.0 + 200.0 * away * x, 400.0 + 200.0 * away * y], axis=-1)
+    if left_out is not None:
+        grid = np.delete(grid, 1 + left_out, axis=0)
+    assert is_even(grid, (801, 801)) == (left_out is None)
+
+
 def test_a_pattern_grows_to_where_it_ends() -> None:
     """From a part of its lines; a line along its border is none of it, and one that the picture cuts is no end."""
     homography = draw.board_from_pixel(5.0, 4e-4)

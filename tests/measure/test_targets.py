@@ -14,11 +14,11 @@ from measure import MarkMeasurement, Scan, Status, TargetOptions, TargetPredicti
 from measure.flags import NO_REASON, Cause
 from measure.results import Covariance, SecondPlace
 from measure.targets.block_search import TargetCandidate
-from measure.targets.consistency import TargetPlaces, compare_targets
+from measure.targets.consistency import SheetImage, TargetPlaces, compare_targets, predict_sheet_points
 from measure.targets.detection import CrossSearch, DiskSearch, cross_candidates, disk_candidates
 from measure.targets.disks import FittedDisk, dust_reasons, fit_disk, fit_plain_disks
 from measure.targets.ring_codes import RingCode, read_code
-from measure.targets.sheets import Dots, Naming, name_dots
+from measure.targets.sheets import Dots, Naming, SheetView, name_dots
 
 Array = NDArray[np.float64]
 CONTRAST, NOISE, GROUND = 20000.0, 600.0, 12000.0
@@ -655,3 +655,28 @@ def make_disk(shape: Array = UNIT_DISK_PX, **figures: Any) -> FittedDisk:
     return FittedDisk(
         converged=True, reason=NO_REASON, center_px=np.zeros(2), pixel_from_mark=matrix, **(known | figures)
     )
+
+
+def radial_grid(largest: float, k1: float, k2: float) -> tuple[Array, Array]:
+    """Places (n, 2) in an image of 800 x 600 px, out to a radius in half diagonals, and those without distortion."""
+    place = np.stack(np.meshgrid(*2 * [np.linspace(-0.7, 0.7, 15)]), axis=-1).reshape(-1, 2)
+    place *= largest / np.hypot(*place.T).max()
+    r2 = (place**2).sum(axis=1, keepdims=True)
+    return 500.0 * place + [399.5, 299.5], place * (1.0 + k1 * r2 + k2 * r2**2)
+
+
+@pytest.mark.parametrize(("k1", "k2"), [(1.5, 0.5), (0.0, 2.0), (-0.3, 0.0)])
+def test_a_view_inverts_the_distortion_of_a_fisheye(k1: float, k2: float) -> None:
+    places_px, undistorted = radial_grid(1.0, k1, k2)
+    view = SheetView(np.eye(3), np.array([k1, k2]), (800, 600))
+    assert np.abs(view.places_px(undistorted) - places_px).max() < 1e-6
+
+
+def test_points_where_a_view_just_ends_are_left_out() -> None:
+    """The distortion turns back at a radius of 0.976: beside it a place exists, but none on its other side."""
+    places_px, undistorted = radial_grid(0.9755, -0.35, 0.0)
+    image = SheetImage(np.arange(225), places_px, np.tile(np.eye(2), (225, 1, 1)), (800, 600))
+    (points,) = predict_sheet_points([image], np.column_stack([undistorted, np.zeros(225)]))
+    assert points is not None
+    assert 200 < len(points.index) < 225
+    assert np.isfinite(points.by_point).all()
