@@ -72,19 +72,18 @@ SEED = 9
 
 def cells() -> Iterator[Row]:
     yield {"quantity": "none", "sigmas": 0.0}
-    yield from ({"quantity": quantity, "sigmas": sigmas} for sigmas in (2.0, 3.0, 5.0) for quantity in ("c", "k5"))
+    yield from ({"quantity": name, "sigmas": sigmas} for sigmas in (2.0, 3.0, 5.0) for name in ("c", "x0", "k5"))
 
 
 def case(
     quantity: str, sigmas: float, seed: int, pairs: int = 300, series: bool = False, adjustment: bool = False
 ) -> Row:
     if adjustment:
-        return {"drift": contradicted(sigmas, pairs, LEVEL)} if quantity != "k5" else {}
+        return {"drift": contradicted(sigmas, pairs, LEVEL)} if quantity in ("none", "c") else {}
     rng, change = np.random.default_rng(seed), np.zeros(len(NAMES))
-    if quantity == "k5":
-        change[4] = sigmas * np.sqrt(2) * np.sqrt(1 - TIED[3, 4] ** 2) * SIGMAS[4]
-    else:
-        change[0] = sigmas * np.sqrt(2) * SIGMAS[0]
+    at = NAMES.index(quantity) if sigmas else 0
+    given_k3 = np.sqrt(1 - TIED[3, 4] ** 2) if quantity == "k5" else 1.0
+    change[at] = sigmas * np.sqrt(2) * given_k3 * SIGMAS[at]
     years = YEARS if series else YEARS[[0, -1]]
     of_year = (years - years[0]) / np.ptp(years)
     found = [

@@ -2,8 +2,9 @@
 
 A calibration maps every camera point to a ray and places the fiducial marks. Two calibrations are equivalent if they
 differ only by changes without effect: a similarity of the fiducial frame, which the interior orientation of a scan
-absorbs, and a rotation of the rays, which the exterior orientation absorbs. The remaining difference is a field over
-the frame with a known covariance.
+absorbs, and a rotation of the rays, which the exterior orientation absorbs. The pixels of a digital camera, which has
+no fiducials, are no convention: its frame has no similarity. The remaining difference is a field over the frame with a
+known covariance.
 """
 
 from collections.abc import Sequence
@@ -24,7 +25,7 @@ Use = Literal["space", "flat"]
 _GRID = 7  # points per side of the field
 _UNSEEN_UM = 0.01  # negligible in any photograph: smaller differences and standard deviations count as zero
 _RANK = 1e-9
-_SIMILARITY = 4  # parameters: shift, rotation and scale of a plane
+_ROTATIONS = 3  # of the rays, the first changes of an orientation
 
 
 @dataclass(frozen=True)
@@ -121,10 +122,11 @@ def compare(
     shared = tuple(id for id in calibrations[0].fiducials if all(id in each.fiducials for each in calibrations))
     across, along = np.linspace(corners_mm[0], corners_mm[1], _GRID).T
     places = np.stack(np.meshgrid(across, along), axis=-1).reshape(-1, 2)
-    views = [_view(each, calibrations[0], places, shared, use) for each in calibrations]
+    is_film = any(each.fiducials for each in calibrations)
+    views = [_view(each, calibrations[0], places, shared, use, is_film) for each in calibrations]
     redundancies = [each.redundancy for each in calibrations if each.redundancy > 0.0]
     same, trend = _tests(views, when, min(redundancies, default=0.0))
-    freeing, count = _freeing(views[0].unseen, len(shared)), len(places)
+    freeing, count = _freeing(views[0], len(shared)), len(places)
     one = np.eye(len(views))
     field, covariance = map(
         np.array, zip(*(_free_view(views, freeing, each - one[0]) for each in one[1:]), strict=True)
@@ -159,16 +161,23 @@ def sigmas(covariance: Array) -> Array:
 class _View(NamedTuple):
     """Rays of the places and positions of the shared fiducials by one calibration, in the axes of the first one.
 
-    value (2 (m + f),), µm; root (2 (m + f), n): square root of its covariance; unseen (2 (m + f), q): its changes with
-    the similarity of the frame and with the orientation, which have no effect.
+    value (2 (m + f),), µm; root (2 (m + f), n): square root of its covariance. Its changes without effect: of_frame
+    (2 (m + f), 4), with the similarity of the frame, none for a digital camera; of_orientation (2 (m + f), q).
     """
 
     value: Array
     root: Array
-    unseen: Array
+    of_frame: Array
+    of_orientation: Array
+
+    @property
+    def unseen(self) -> Array:
+        return np.hstack([self.of_frame, self.of_orientation])
 
 
-def _view(own: CameraCalibration, first: CameraCalibration, places_mm: Array, shared: Sequence[str], use: Use) -> _View:
+def _view(
+    own: CameraCalibration, first: CameraCalibration, places_mm: Array, shared: Sequence[str], use: Use, is_film: bool
+) -> _View:
     c_um = 1e3 * first.lens.interior[0]
     marks, there = (np.array([each.fiducials[id] for id in shared]).reshape(-1, 2) for each in (own, first))
     frame, shift = _similarity(there, marks)
@@ -202,9 +211,9 @@ def _view(own: CameraCalibration, first: CameraCalibration, places_mm: Array, sh
     of_frame = np.concatenate([field_change(equations.xy_jacobian @ moves[:count]), -1e3 * moves[count:]])
     bundle = c_um * ray_by_orientation(ray, np.ones(count))[:, :, : 6 if use == "flat" else 3]  # rotations, shifts
     orientation = np.concatenate([bundle, np.zeros((len(marks), *bundle.shape[1:]))])
-    unseen = np.concatenate([of_frame, orientation], axis=2).reshape(2 * len(points), -1)
+    of_frame, of_orientation = (each.reshape(2 * len(points), -1) for each in (of_frame, orientation))
     value = np.concatenate([c_um * ray, 1e3 * (marks - shift) @ np.linalg.inv(frame).T])
-    return _View(value.ravel(), root, unseen)
+    return _View(value.ravel(), root, of_frame if is_film else of_frame[:, :0], of_orientation)
 
 
 def _similarity(first: Array, second: Array) -> tuple[Array, Array]:
@@ -218,13 +227,14 @@ def _similarity(first: Array, second: Array) -> tuple[Array, Array]:
     return turn, there - turn @ middle
 
 
-def _freeing(unseen: Array, marks: int) -> Array:
+def _freeing(view: _View, marks: int) -> Array:
     """(2 (m + f), 2 (m + f)) projector that removes the similarity fitted to the marks, then the orientation fitted to
     the field, both by unweighted least squares: the remaining field is the smallest possible."""
-    of_marks, everything = np.arange(len(unseen)) >= len(unseen) - 2 * marks, np.eye(len(unseen))
-    frame = unseen[:, :_SIMILARITY] if marks > 1 else unseen[:, :0]
-    by_marks = everything - frame @ np.linalg.pinv(frame * of_marks[:, None], rcond=_RANK)
-    rest = unseen[:, frame.shape[1] :]
+    of_marks, everything = np.arange(len(view.value)) >= len(view.value) - 2 * marks, np.eye(len(view.value))
+    by_marks, rest = everything, view.unseen
+    if marks > 1:
+        frame, rest = view.of_frame, view.of_orientation
+        by_marks = everything - frame @ np.linalg.pinv(frame * of_marks[:, None], rcond=_RANK)
     by_field = everything - rest @ np.linalg.pinv(rest * ~of_marks[:, None], rcond=_RANK)
     return np.asarray(by_field @ by_marks)
 
@@ -248,9 +258,12 @@ def _tests(views: Sequence[_View], times: Array, redundancy: float) -> tuple[Tes
     if not known.any():
         raise AdjustmentError("none of the calibrations has standard deviations: there is nothing to compare with.")
     basis, unseen = left[:, known], views[0].unseen
+    # What a rotation changes outside these directions tells it from a shift of the principal point.
+    rotations = views[0].of_orientation[:, :_ROTATIONS]
+    rotations = rotations / np.linalg.norm(rotations, axis=0)
+    outside, lengths, _ = np.linalg.svd(rotations - basis @ (basis.T @ rotations), full_matrices=False)
+    basis = np.hstack([basis, outside[:, lengths > _RANK]])
     inside = basis.T @ unseen
-    # Drop those outside the basis, such as a rotation of the whole field.
-    inside *= np.linalg.norm(inside, axis=0) > _RANK * np.linalg.norm(unseen, axis=0)
     right, steady, moving, unseen_rows = list[Array](), list[Array](), list[Array](), list[Array]()
     for view, time in zip(views, times - times[0], strict=True):
         covariance = basis.T @ view.root @ view.root.T @ basis + _UNSEEN_UM**2 * np.eye(basis.shape[1])

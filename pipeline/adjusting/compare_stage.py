@@ -157,10 +157,9 @@ def print_comparison(comparison: Comparison, record: ComparisonRecord, console: 
 
 
 def _why(comparison: Comparison, level: float) -> str:
-    taken = {
-        "space": "the camera's attitude and a similarity of the fiducial marks",
-        "flat": "the camera's attitude and station over flat ground, and a similarity of the fiducial marks",
-    }[comparison.use]
+    of_marks = ", and a similarity of the fiducial marks" if any(c.fiducials for c in comparison.calibrations) else ""
+    orientation = {"space": "the camera's attitude", "flat": "the camera's attitude and station over flat ground"}
+    taken = f"{orientation[comparison.use]}{of_marks}"
     same, trend = comparison.same, comparison.trend
     counted = f"chi-square {same.chi_square:.1f}, {same.freedom} degrees of freedom"
     of_what = counted if trend is None else "twice the smaller one of two tests"
