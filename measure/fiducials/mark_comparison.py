@@ -283,7 +283,8 @@ def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fi
 
     Returns
     -------
-    (arms,) relative lengths, in the order of the bars' ends, and their standard deviations.
+    (arms,) relative lengths, in the order of the bars' ends, and their standard deviations; nan of an arm whose end no
+    pixel shows.
     """
     place = pixel_from_mark - np.column_stack([np.zeros((2, 2)), window.origin_px])
     height, width = window.grey.shape
@@ -292,7 +293,8 @@ def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fi
     used = window.usable & (window.ends == 0)
     design = np.stack([*changes, drawn, *background_planes(height, width)])[:, used]
     grey = window.grey[used]
-    inverse: Array = np.asarray(np.linalg.pinv(design @ design.T), float)
+    normal = design @ design.T
+    inverse: Array = np.asarray(np.linalg.pinv(normal), float)
     solution = inverse @ (design @ grey)
     left = grey - solution @ design
     # Noise correlated by rho along columns and rows reduces the effective number of pixels.
@@ -300,7 +302,9 @@ def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fi
     variance = float(left @ left) / max(len(grey) - len(design), 1) * ((1 + rho) / (1 - rho)) ** 2
     gain = solution[len(changes)]
     gain = gain if abs(gain) > _LEAST_GAIN * abs(fit.contrast_dn) else fit.contrast_dn
-    sigmas = np.sqrt(variance * np.diag(inverse)[: len(changes)]) / abs(gain)
+    # At least 1 for each unknown that the pixels show; the pseudo-inverse holds nothing of the others.
+    is_shown = np.diag(normal) * np.diag(inverse) > 0.5
+    sigmas = np.sqrt(variance * np.where(is_shown, np.diag(inverse), np.nan)[: len(changes)]) / abs(gain)
     return 1 + solution[: len(changes)] / gain, sigmas
 
 

@@ -216,6 +216,14 @@ def test_lengths_of_arms_are_those_drawn_and_known_as_well_as_claimed() -> None:
     assert 0.7 < np.std(normalised, axis=0).mean() < 1.3
 
 
+def test_the_length_of_an_arm_whose_end_no_pixel_shows_is_not_known() -> None:
+    place = np.array([[27.0, 0.0, 40.0], [0.0, -27.0, 40.0]])
+    window = ScanWindow(6000 * brute_picture(GIVEN, place, 80, 80, 1.0) + 3000)
+    hidden = window.exclude(np.tile(np.arange(80) < 30, (80, 1)))
+    _, sigmas = measure_arms(hidden, GIVEN, place, match(window, GIVEN, place))
+    assert np.isnan(sigmas).tolist() == [True, False, False, False], sigmas
+
+
 @pytest.mark.parametrize(("poses", "agree"), [(("0", "0", "0m"), True), (("0", "0", "0"), False)])
 def test_a_turn_is_compared_as_the_camera_has_it(poses: tuple[str, ...], agree: bool) -> None:
     """Two frames have the mark turned by 3 degrees to the left, one to the right: the same turn if that is mirrored."""
