@@ -263,7 +263,14 @@ def measure_stage(
         evaluated = [(tried * false_frames(result, frame, frame.unblemished), frame) for frame in frames]
     else:
         evaluated = [each for frame in measured if (each := _evaluate(frame, result, tried))]
-    return sorted(evaluated, key=itemgetter(0))
+    return sorted(evaluated, key=_rank)
+
+
+def _rank(evaluated: Evaluated) -> tuple[float, float]:
+    """Order of frames: of significant ones, most marks first; they may be a lattice named one step off, of whose fewer
+    marks in the scan a larger share is found."""
+    expected, frame = evaluated
+    return (-len(frame.inlier_fits), expected) if expected <= MAX_FALSE_FRAMES else (expected, 0.0)
 
 
 def best_frame(measured: Iterable[Frame], most_supported: int, result: SearchResult) -> Frame | None:

@@ -628,6 +628,25 @@ def test_under_another_pitch_the_marks_together_decide_on_a_frame(monkeypatch: p
     assert expected == pytest.approx(1e-3)  # two criteria, five hypotheses
 
 
+def test_of_frames_that_are_all_significant_the_one_with_most_marks_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lattice one step off has fewer marks in its scan, and may have found a larger share of them."""
+    placements, frames = list[Placement](), dict[int, Any]()
+    for marks, expected in ((19, 1e-36), (21, 1e-33), (22, 10.0)):
+        placements.append(Placement("0", np.eye(2, 3) + 900 * marks * np.eye(2, 3, 2), 1.0, marks, 1, 1, (0.05, 0.05)))
+        frames[marks] = cast(Any, Stand(f"{marks} marks"))
+        frames[marks].agrees, frames[marks].options = True, FiducialOptions(pose="0")
+        frames[marks].inlier_fits, frames[marks].expected = dict.fromkeys(range(marks)), expected
+        frames[marks].placement = placements[-1]
+    monkeypatch.setattr(stages, "distinct_places", lambda *_: placements)
+    for function in ("measure_frame", "detect_some"):
+        monkeypatch.setattr(stages, function, lambda _, __, place, *___: frames[place.supported])
+    monkeypatch.setattr(stages, "false_placements", lambda *_: 0.5)
+    monkeypatch.setattr(stages, "false_frames", lambda _, frame, __: frame.expected)
+    stage = Stage("pitch", [GIVEN], FiducialOptions())
+    ranked = stages.measure_stage(SCAN, ALIKE, stage, SearchResult(tuple(placements)), 5)
+    assert [cast(Stand, frame).name for _, frame in ranked] == ["21 marks", "19 marks", "22 marks"]
+
+
 def test_where_nothing_was_detected_the_reason_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     found, _ = search_attempts(monkeypatch, None, None)
     assert name(found) == ""
