@@ -20,7 +20,7 @@ from measure.fiducials.measure_frame import Frame, measure_frame, rename_frame
 from measure.fiducials.options import CLICK_SIGMA_PX, Click, FiducialOptions
 from measure.fiducials.scan_orientation import decide_scan_orientation
 from measure.fiducials.search import SearchResult
-from measure.fiducials.stages import doubt_frame, false_placements, find_frame
+from measure.fiducials.stages import doubt_frame, false_placements, find_frame, find_in_negative
 from measure.flags import MAX_FALSE_FRAMES, NO_REASON, Cause, Code, Reason, Status
 from measure.geometry import UP_FROM_CAMERA
 from measure.marks.shapes import (
@@ -39,6 +39,7 @@ from measure.scans.scan import Scan
 _SET = ("set in the project.",)
 _FAINT = Reason("the frame was found only by its faint marks together", Code.FAINT_FRAME)
 _UNSURE = Reason("No mark passed all checks: the frame may lie elsewhere.", Code.CHANCE)
+_NEGATIVE = "The scan is a negative of what the camera file draws: its marks were found with light and dark exchanged."
 _OBLIQUE = Reason(
     "only a perspective fits its marks: the film was photographed obliquely. Set transformation = "
     '"projective" under [adjust].',
@@ -108,7 +109,9 @@ def _search_frame(
     scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
 ) -> FrameMeasurement:
     """Search for the frame without clicks that give its place, and measure its marks."""
-    found = find_frame(scan, layout, pitch_um, options)
+    found, notes = find_frame(scan, layout, pitch_um, options), tuple[str, ...]()
+    if found.frame is None and (in_negative := find_in_negative(scan, layout, pitch_um, options)):
+        found, notes = in_negative, (_NEGATIVE,)
     frame, result = found.frame, found.result
     lines = _read(scan, layout, frame) if options.writing == "all" else None
     if frame is None:
@@ -140,7 +143,8 @@ def _search_frame(
         pose = replace(pose, decided=False, evidence=(*pose.evidence, *doubts))
     if frame.options.film_model != options.film_model:
         problems.append(_OBLIQUE)
-    return replace(present_frame(frame, pose, pitch_um, problems, _FAINT if is_faint else doubt), writing=lines)
+    shown = present_frame(frame, pose, pitch_um, problems, _FAINT if is_faint else doubt)
+    return replace(shown, writing=lines, notes=(*notes, *shown.notes))
 
 
 def _fitting_pose(
@@ -295,8 +299,6 @@ def absent_frame(
         "check whether the camera is that of the scan, the pitch right, and the film laid within "
         f"{rotation_deg:g} degrees of upright or of a quarter turn"
     )
-    if all(mark.mark.polarity != "auto" for mark in layout.marks):
-        remedy += ', and the scan no negative of what the camera file draws (polarity = "auto" takes both)'
     if Code.NO_FIT in reason.codes:
         remedy = "compare the drawings of these marks with the scan, or set tone under [measure] in the project"
     coarse, finest_um = NO_REASON, 1000 * min(finest_detail_mm(mark.mark) for mark in layout.marks)

@@ -9,7 +9,7 @@ false-alarm rate of one mark is therefore the share of other places that correla
 mark found: all places of the reduced scan, or places beside the marks at full resolution.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import itemgetter
@@ -186,7 +186,27 @@ def find_frame(
     scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
 ) -> StageResult:
     """Find the frame of a scan. pitch_um: given by the user or the file, None if unknown."""
-    stages = list_stages(scan, layout, pitch_um, options)
+    return _find_in_stages(scan, layout, list_stages(scan, layout, pitch_um, options), options)
+
+
+def find_in_negative(
+    scan: Scan, layout: FiducialLayout, pitch_um: tuple[float, float] | None, options: FiducialOptions
+) -> StageResult | None:
+    """Find the frame of a scan that is a negative of what the layout draws; None without a significant one.
+
+    The prior belief about the scan and the likeliest other pitches must do: scans without a frame would take twice as
+    long.
+    """
+    shown = layout.negative
+    likely = [each for each in list_stages(scan, shown, pitch_um, options) if each.tone is None]
+    stages = [each for each in likely if each.is_given] + [each for each in likely if each.kind == "pitch"][:1]
+    found = _find_in_stages(scan, shown, stages, options)
+    return found if found.is_taken and not found.doubt else None
+
+
+def _find_in_stages(
+    scan: Scan, layout: FiducialLayout, stages: Sequence[Stage], options: FiducialOptions
+) -> StageResult:
     search, result = FrameSearch(scan, layout, options), SearchResult()
     found, hypotheses_so_far, hypotheses_at_given_pitch = StageResult(), 0, 0
     for stage in stages:

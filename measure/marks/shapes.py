@@ -17,6 +17,7 @@ from measure.array_types import Array, Mask
 
 Point = tuple[float, float]
 Polarity = Literal["light", "dark", "auto"]
+_NEGATIVE: Mapping[Polarity, Polarity] = {"light": "dark", "dark": "light", "auto": "auto"}
 Side = Literal["left", "right", "top", "bottom"]
 
 LEARNED_ORIGIN = 0.25  # fraction of a learned mark's size: standard deviation of its template's origin on the mark
@@ -255,6 +256,12 @@ class FiducialLayout:
     def places_mm(self) -> Array:
         """(n, 2) coordinates of the marks."""
         return places_mm(self.marks)
+
+    @property
+    def negative(self) -> "FiducialLayout":
+        """The layout as a negative shows it: marks drawn light are dark there, and the reverse."""
+        marks = (replace(each, mark=replace(each.mark, polarity=_NEGATIVE[each.mark.polarity])) for each in self.marks)
+        return replace(self, marks=tuple(marks))
 
 
 def cross(arm_mm: float, line_mm: float, gap_mm: float = 0.0, angle_deg: float = 0.0) -> tuple[Part, ...]:

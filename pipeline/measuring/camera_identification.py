@@ -270,6 +270,7 @@ class Identification:
     alike : by name, other cameras with similar marks.
     reports : by name, the number of calibration reports behind a camera.
     board : the calibration board in the image, as `reseau calibrate` takes it.
+    is_negative : whether the scan shows the marks of the best trials with light and dark exchanged.
     """
 
     scan: Path
@@ -281,6 +282,7 @@ class Identification:
     alike: Mapping[str, Sequence[str]] = field(default_factory=dict)
     reports: Mapping[str, int] = field(default_factory=dict)
     board: str = ""
+    is_negative: bool = False
 
     @property
     def best(self) -> tuple[Trial, ...]:
@@ -302,6 +304,8 @@ class Identification:
             f"{self.scan.name}: {' or '.join(first.cameras)}, score {first.score:.2f}: {first.found} of {first.drawn} "
             f"marks, likeness {first.likeness:.2f}, signal-to-noise {first.snr:.1f}; {by_chance}."
         )
+        if self.is_negative:
+            text += " The scan is a negative of their drawings: `reseau measure` takes it as it is."
         if len(self.best) > 1:
             text += f" {' or '.join(self.best[1].cameras)} comes close with {self.best[1].score:.2f}."
         elif len(first.cameras) > 1:

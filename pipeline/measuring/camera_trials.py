@@ -199,10 +199,13 @@ def identify(
     layouts = {names: _limit_drawings(cameras[names[0]].layout()) for names in _alike(cameras)}
     pitch = None if given is None else (times * given[0], times * given[1])
     with reporter.stage("trying layout") as count:
-        trials, tries = list[Trial](), dict[Names, Tried]()
-        for tries, most in _attempts(search, layouts, _layouts_like(layouts, likely), pitch, count):
-            trials = _trials(search, tries, count)
-            if any(trial.stands_out and trial.expected <= most for trial in trials):
+        trials, tries, is_negative = list[Trial](), dict[Names, Tried](), False
+        for attempt in _attempts(search, layouts, _layouts_like(layouts, likely), pitch, count):
+            tried = _trials(search, attempt.tries, count)
+            ends = any(trial.stands_out and trial.expected <= attempt.most for trial in tried)
+            if ends or not attempt.is_negative:
+                trials, tries, is_negative = tried, attempt.tries, attempt.is_negative
+            if ends:
                 break
     alike = _alike_in_scan(search, trials, tries, drawn_alike(layouts))
     del search, tries  # frees the correlation images
@@ -215,7 +218,7 @@ def identify(
     plate = {} if reader is None else parse_plate(read_writing(picture, reader, enough=is_whole_plate))
     against_plate = {name: contradictions(camera, plate) for name, camera in cameras.items()}
     contradicted = {name: against for name, against in against_plate.items() if against}
-    return Identification(path, ranked, unreported, given, plate, contradicted, alike, reports)
+    return Identification(path, ranked, unreported, given, plate, contradicted, alike, reports, is_negative=is_negative)
 
 
 def _layouts_like(layouts: Mapping[Names, FiducialLayout], likely: Collection[str]) -> dict[Names, FiducialLayout]:
@@ -264,27 +267,41 @@ def _alike_in_scan(
     return found
 
 
+@dataclass(frozen=True)
+class _Attempt:
+    """Tries of some layouts, and the largest expected number of false alarms for which one of them ends the search."""
+
+    tries: dict[Names, Tried]
+    most: float = np.inf
+    is_negative: bool = False
+
+
 def _attempts(
     search: LayoutSearch,
     layouts: Mapping[Names, FiducialLayout],
     likely: Mapping[Names, FiducialLayout],
     pitch_um: tuple[float, float] | None,
     count: Count,
-) -> Iterator[tuple[dict[Names, Tried], float]]:
-    """Yield tries of likely layouts, then of all at the given pitch, with non-square pixels and at any pitch; with the
-    largest expected number of false alarms for which one of them ends the search."""
-    if likely and pitch_um is None:
-        yield _any_pitch_tries(search, likely, count), MAX_FALSE_CAMERAS
-    if pitch_um is not None:
-        for some, most in ((likely, MAX_FALSE_CAMERAS), (layouts, np.inf)):
-            given = _each(some, partial(search.try_pitch, pitch_um=pitch_um), count)
-            if any(each.answer.expected <= MAX_FALSE_CAMERAS for each in given.values()):
-                yield given, most
-        by_stretch = partial(search.try_pitch, pitch_um=pitch_um, stretches=_STRETCHES)
-        stretched = _each(layouts, by_stretch, count)
-        pairs = {names: (each, stretched[names]) for names, each in given.items()}
-        yield {names: min(pair, key=lambda each: each.answer.expected) for names, pair in pairs.items()}, np.inf
-    yield _any_pitch_tries(search, layouts, count), np.inf
+) -> Iterator[_Attempt]:
+    """Yield tries of likely layouts, then of all at the given pitch, with non-square pixels, at any pitch and as a
+    negative shows them."""
+    negatives = {names: layout.negative for names, layout in layouts.items()}
+    if pitch_um is None:
+        if likely:
+            yield _Attempt(_any_pitch_tries(search, likely, count), MAX_FALSE_CAMERAS)
+        yield _Attempt(_any_pitch_tries(search, layouts, count))
+        yield _Attempt(_any_pitch_tries(search, negatives, count), MAX_FALSE_CAMERAS, is_negative=True)
+        return
+    at_given = partial(search.try_pitch, pitch_um=pitch_um)
+    for some, most in ((likely, MAX_FALSE_CAMERAS), (layouts, np.inf)):
+        given = _each(some, at_given, count)
+        if any(each.answer.expected <= MAX_FALSE_CAMERAS for each in given.values()):
+            yield _Attempt(given, most)
+    stretched = _each(layouts, partial(at_given, stretches=_STRETCHES), count)
+    pairs = {names: (each, stretched[names]) for names, each in given.items()}
+    yield _Attempt({names: min(pair, key=lambda each: each.answer.expected) for names, pair in pairs.items()})
+    yield _Attempt(_any_pitch_tries(search, layouts, count))
+    yield _Attempt(_each(negatives, at_given, count), MAX_FALSE_CAMERAS, is_negative=True)
 
 
 def _each(

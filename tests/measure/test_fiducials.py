@@ -11,9 +11,7 @@ from studies import parametrize_with_studies
 
 from measure import Code, FiducialLayout, FiducialOptions, MarkShape, Status, dot, polygon, ring_cross
 from measure.fiducials.measure_frame import rename_frame
-from measure.fiducials.measurement import absent_frame
 from measure.fiducials.stages import find_frame
-from measure.flags import Reason
 from measure.geometry import POSES
 from measure.marks.shapes import Disk, Part, finest_detail_mm
 
@@ -133,12 +131,13 @@ def test_dark_marks_and_an_unknown_pitch() -> None:
     draw.assert_right(result, draw.NUMBERED, matrix)
 
 
-def test_a_negative_is_named_where_marks_have_a_polarity() -> None:
-    scan = draw.make_scan(np.full((60, 60), 20000.0))
-    words = 'no negative of what the camera file draws (polarity = "auto" takes both)'
-    for layout, is_named in ((polarised("light"), True), (polarised("auto"), False)):
-        (problem,) = absent_frame(scan, layout, Reason("none was found"), 6.0, None).problems
-        assert (words in problem) == is_named
+def test_a_negative_is_measured_as_it_is() -> None:
+    matrix = draw.pixel_from_camera("0")
+    result = draw.measure_grey(20000 - draw.frame_picture(draw.NUMBERED, matrix), polarised("light"))
+    draw.assert_right(result, draw.NUMBERED, matrix)
+    assert "a negative of what the camera file draws" in result.notes[0]
+    positive = draw.measure_grey(draw.frame_picture(draw.NUMBERED, matrix), polarised("light"))
+    assert not any("negative" in note for note in positive.notes)
 
 
 def polarised(polarity: Literal["light", "auto"]) -> FiducialLayout:

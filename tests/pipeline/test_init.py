@@ -495,6 +495,27 @@ def test_marks_finer_than_the_pixels_are_not_those_of_a_camera(tmp_path: Path) -
     assert found.trials[0].reason == "too coarse: the finest detail of its marks would be 0.20 px wide there"
 
 
+def test_a_negative_names_its_camera(tmp_path: Path) -> None:
+    """Dark ring crosses on a lighter ground, of a camera whose file draws light ones."""
+    places = [(-50.0, -50.0), (50.0, -50.0), (-50.0, 50.0), (50.0, 44.0)]
+    fiducials = (f"{{id = '{id}', xy_mm = {list(xy)}, sigma_mm = 0.01, mark = 'm'}}" for id, xy in enumerate(places))
+    shape = "kind = 'ring-cross'\nring_mm = 4.0\nring_line_mm = 1.25\narm_mm = 8.0\nline_mm = 1.25\npolarity = 'light'"
+    file = tmp_path / "camera.toml"
+    file.write_text(
+        f"name = 'Big'\nframe_mm = [120.0, 120.0]\nfiducial = [{', '.join(fiducials)}]\n[mark.m]\n{shape}\n"
+    )
+    grey = np.random.default_rng(1).normal(160.0, 4.0, (528, 528))
+    for x, y in places:
+        column, row = round(264 + x / 0.25), round(264 - y / 0.25)
+        cv2.circle(grey, (column, row), 16, 110.0, 5)
+        cv2.line(grey, (column - 32, row), (column + 32, row), 110.0, 5)
+        cv2.line(grey, (column, row - 32), (column, row + 32), 110.0, 5)
+    cv2.imwrite(str(tmp_path / "a.png"), cv2.GaussianBlur(grey, (0, 0), 1.0).astype(np.uint8))
+    found = identify(tmp_path / "a.png", {"big": read_camera(file)}, 250.0, Reporter(quiet=True))
+    assert found.best_names() == ("big",), found.trials
+    assert "a negative of their drawings" in found.sentence()
+
+
 def test_what_an_identification_says_of_chance_pitch_and_close_cameras() -> None:
     found = Identification(Path("a.tif"), (trial(("a",), 0.5, 0.3), trial(("b",), 0.0, None)))
     assert found.best == ()
