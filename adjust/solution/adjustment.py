@@ -120,25 +120,30 @@ def adjust_unmodelled(network: Network, options: Options | None = None, pixel_mm
         With the added standard deviations in `unmodelled_mm`. Raises AdjustmentError as `adjust` does.
     """
     options = options or Options()
-    first = _fit_unmodelled(network, options)
     plausible_mm = {each.name: PLAUSIBLE * float(np.hypot(*each.frame_mm)) for each in network.cameras}
-    doubtful = [
-        name
-        for name, limit_mm in plausible_mm.items()
-        if limit_mm and (first.unmodelled_mm[name] > limit_mm or _is_of_some_frames(first, name))
-    ]
+    refitted = partial(_fit_unmodelled, options=options)
 
-    def agrees(result: Adjustment) -> bool:
-        return result.converged and all(
-            result.unmodelled_mm[name] <= plausible_mm[name]
-            and CLEARER * _marks_sigma_mm(result, name) <= _marks_sigma_mm(first, name)
-            for name in doubtful
-        )
+    def without_contradicting(given: Network, first: Adjustment) -> Adjustment:
+        doubtful = [
+            name
+            for name, limit_mm in plausible_mm.items()
+            if limit_mm and (first.unmodelled_mm[name] > limit_mm or _is_of_some_frames(first, name))
+        ]
 
-    result = first
-    if doubtful:
-        refitted = partial(_fit_unmodelled, options=options)
-        result = _leave_out_contradicting(network, first, refitted, agrees, several=True)
+        def agrees(result: Adjustment) -> bool:
+            return result.converged and all(
+                result.unmodelled_mm[name] <= plausible_mm[name]
+                and CLEARER * _marks_sigma_mm(result, name) <= _marks_sigma_mm(first, name)
+                for name in doubtful
+            )
+
+        if not doubtful:
+            return first
+        found = _leave_out_contradicting(given, first, refitted, agrees, several=True)
+        rest = _leave_out(given, found.left_out.keys() - first.left_out.keys()) if found is not first else None
+        return found if rest is None else without_contradicting(rest, found)  # less gross ones show only then
+
+    result = without_contradicting(network, refitted(network))
     per_mm, unit = (1000.0, "µm") if pixel_mm is None else (1.0 / pixel_mm, "px")
     warnings = (
         f"Camera {name}: errors of {per_mm * sigma_mm:.3g} {unit} are not modelled, one part in "
@@ -483,7 +488,8 @@ def _leave_out_contradicting(
     Each has to dominate the residuals of its camera with all its marks. Where several may do so together, that one of
     the TRIED worst is left out without which the residuals are smallest.
     """
-    most, out, last = MOST_CONTRADICTING * len({image.frame for image in network.images}), list[str](), first
+    frames = {image.frame for image in network.images} | first.left_out.keys()
+    most, out, last = MOST_CONTRADICTING * len(frames) - len(first.left_out), list[str](), first
     while not agrees(last):
         worst, trials = _frames_by_error(last, several)[: TRIED if several else 1], dict[str, Adjustment]()
         for each in worst if len(out) + 1 <= most else ():

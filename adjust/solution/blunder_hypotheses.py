@@ -96,8 +96,7 @@ def network_hypotheses(network: Network, bare: Network, given: Adjustment | None
     heights = _one_axis(network, (2,)) if is_far else ()  # before distances, of which one may do the same
     # With any units of the axes linear transformations of the given points fit all images, but the adjustment does not.
     large_mm = LARGE * np.ptp(network.observations.xy_mm)
-    # Images that look straight at a flat field cannot start either, and fit a stretched one by tilts.
-    misses = given is not None and (not given.converged or np.sqrt(np.mean(given.residuals.v_mm**2)) > large_mm)
+    misses = given is None or not given.converged or np.sqrt(np.mean(given.residuals.v_mm**2)) > large_mm
     is_stretched = is_far and misses and all(each.misfit < LARGE for each in transformed_fields(network))
     plane = _one_axis(network, (0, 1)) if is_stretched else ()
     yield from ([each] for each in chain(exchanged, heights, mirrored_images, _distances(network), plane))
@@ -277,6 +276,12 @@ def exchanged_cameras(network: Network, given: Adjustment, trials: Trials) -> st
     )
 
 
+def _hold_principal_distances(network: Network) -> Network:
+    """Fix principal distances at 1.5 times the extent of the images: any value shows whether they are determinable."""
+    held = Prior(1.5 * float(np.ptp(network.observations.xy_mm)), 0.0)
+    return replace(network, cameras=tuple(replace(each, principal_distance_mm=held) for each in network.cameras))
+
+
 def blunder_sentence(network: Network, given: Adjustment | None, trials: Trials) -> str:
     """Describe the blunder of a whole network without which all observations agree; empty where there is none.
 
@@ -286,6 +291,9 @@ def blunder_sentence(network: Network, given: Adjustment | None, trials: Trials)
     """
     if given is None:  # perhaps only the given approximations are wrong
         given = trials.adjust(network)
+        # Images that look straight at a flat field fit with any principal distance, and a stretched field by tilts.
+        if given is None and trials.explains(trials.adjust(_hold_principal_distances(network))):
+            return ""
     if given is not None and (cameras := exchanged_cameras(network, given, trials)):
         return cameras
     if trials.explains(given):

@@ -355,6 +355,16 @@ def test_a_picture_of_another_size_is_left_out_where_the_noise_is_fitted(seed: i
     assert abs(result.value("IO.cam.c") - faults.C_MM) < 4.0 * result.sigma("IO.cam.c")
 
 
+def test_a_picture_of_nearly_the_size_is_left_out_after_a_grosser_one() -> None:
+    """It had stayed, since errors were smaller by far without the other alone."""
+    kind, rng = replace(FITTED, frame_given=True), np.random.default_rng(12)
+    given = faults.misfit_network(faults.scene(12, flat=True), faults.Effects(noise=3.0), kind, rng)
+    times = np.array([{"im01": 0.5, "im04": 0.95}.get(name, 1.0) for name in given.observations.image])
+    result = adjust_unmodelled(nets.set_observations(given, xy_mm=given.observations.xy_mm * times[:, None]))
+    assert sorted(result.left_out) == ["im01", "im04"]
+    assert abs(result.value("IO.cam.c") - faults.C_MM) < 4.0 * result.sigma("IO.cam.c")
+
+
 @pytest.mark.parametrize(("apart_um", "is_named"), [(0.0, True), (0.3, True), (0.7, True), (1.4, False)])
 def test_one_picture_under_two_names_is_named(apart_um: float, is_named: bool) -> None:
     """Independent errors of 1 µm lie 1.4 µm apart."""
