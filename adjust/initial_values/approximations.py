@@ -193,18 +193,22 @@ def _interior(camera: Camera, frames: Frames, resected: dict[str, Pose]) -> Arra
         center if prior is None else prior.value
         for prior, center in zip((camera.x0_mm, camera.y0_mm), camera.center_mm, strict=True)
     )
-    if camera.principal_distance_mm is not None:
-        return np.array([camera.principal_distance_mm.value, x0, y0])
+    given, is_pinhole = camera.principal_distance_mm, family(camera.distortion.family).is_pinhole_at_zero
+    # One without weight is an approximation: far off, it may lead to a wrong minimum, with images tilted the other way.
+    if given is not None and (np.isfinite(given.sigma) or not is_pinhole):
+        return np.array([given.value, x0, y0])
     of_images = _known_fields(camera, frames, np.array([x0, y0]))
     fields = list(of_images.values())
-    if family(camera.distortion.family).is_pinhole_at_zero:
+    if is_pinhole:
         found, poses = find_principal_distance(fields)
         values, sigmas = frames.network.point_priors
         has_approximate_points = bool((np.isinf(sigmas) & ~np.isnan(values)).any())  # which the adjustment does not use
-        if not camera.distortion.values.any() and not has_approximate_points:
+        if found is not None and not camera.distortion.values.any() and not has_approximate_points:
             resected |= {name: poses[field] for name, field in of_images.items() if field in poses}
     else:
         found = find_wide_distance(fields, camera.distortion)
+    if found is None and given is not None:
+        found = given.value
     if found is None:
         why = _why_no_distance(fields)
         raise AdjustmentError(f"the principal distance of camera {camera.name} cannot be found from its images: {why}")

@@ -264,9 +264,10 @@ def _lens_problems(data: ReportData, solved: AdjustmentRecord) -> Iterator[Repor
     images alone have to determine and hardly do."""
     for name, camera in solved.cameras.items():
         c = camera.principal_distance_mm
-        if not (c.given and math.isfinite(c.given.sigma)) and c.sigma > LOOSE * c.value:
+        sigma = max(c.sigma, c.sigma_clusters or 0.0)
+        if not (c.given and math.isfinite(c.given.sigma)) and sigma > LOOSE * c.value:
             yield ReportedProblem(
-                f"The principal distance of {name} is known to {100.0 * c.sigma / c.value:.1g} % only: the images "
+                f"The principal distance of {name} is known to {100.0 * sigma / c.value:.1g} % only: the images "
                 "hardly separate it from how far away they were taken.",
                 "Tilt the board, or the camera, by 20 to 45 degrees in different directions.",
                 section="camera",

@@ -368,7 +368,7 @@ def test_heights_alone_and_two_points_orient_vertical_frames() -> None:
         ("ii_juhl_3photos", 0.5, 1e-3),
         ("iii_selfcal_mixed", 60.0, 0.03),
         ("iii_selfcal_all_unknown_datum_A", 150.0, 0.1),
-        ("iv_planar_board", 0.3, 3e-4),
+        ("iv_planar_board", 2.0, 3e-4),
         ("v_singular_K2D_vert0_affine", 1e-3, 1e-6),
         ("v_singular_K3D_conv_affine", 1e-3, 1e-6),
     ],
@@ -433,9 +433,10 @@ def test_tilted_frames_are_oriented_and_calibrate_the_camera(seed: int) -> None:
     assert abs(c - TILTED.c) < 4 * sigma < 4.0
 
 
-@parametrize_with_studies("sigma", [2.0, np.inf], quick=(1,))
+@pytest.mark.parametrize("sigma", [2.0, np.inf])
 def test_a_principal_distance_that_is_a_guess_is_found_from_the_images(sigma: float) -> None:
-    """Twice the true one, and known no better than that: it is sought where the iteration does not converge."""
+    """Twice the true one, and known no better than that: it is sought where the iteration does not converge; one
+    without weight at once."""
     rng = np.random.default_rng(1)
     network, _ = nets.simulated(rng, points=nets.field_points(rng, 40))
     camera = network.cameras[0]
@@ -445,7 +446,33 @@ def test_a_principal_distance_that_is_a_guess_is_found_from_the_images(sigma: fl
         guessed = nets.set_camera(network, principal_distance_mm=Prior(guess, known))
         result = adjust(guessed, options=Options(iteration_limit=7))
         assert result.converged == converges
-        assert any("repeated with approximations" in remark for remark in result.remarks) == converges
+        is_repeated = any("repeated with approximations" in remark for remark in result.remarks)
+        assert is_repeated == (converges and np.isfinite(known))
+
+
+def telephoto_network(seed: int) -> Network:
+    """Eight pictures of a board by a lens of five frame widths, with errors of 3 µm and a guess of one width."""
+    rng, views = np.random.default_rng(seed), []
+    grid = np.array([[25.0 * column, 25.0 * row, 0.0] for row in range(6) for column in range(9)])
+    for _ in range(8):
+        turn = nets.rotation(*rng.uniform(-0.5, 0.5, 2), rng.uniform(-0.3, 0.3))
+        aside, away = rng.uniform(-100.0, 100.0, 2), -2500.0 * rng.uniform(0.8, 1.2)
+        x, y, z = ((grid - grid.mean(axis=0)) @ turn + [*aside, away]).T
+        views.append(np.stack([-50.0 * x / z, -50.0 * y / z], axis=1))
+    places = np.array(views) + rng.normal(0.0, 0.003, (8, 54, 2))
+    xyz = {f"b{number}": place for number, place in enumerate(grid)}
+    distortion = Distortion("opencv", {"k1": Prior(0.0, np.inf)})
+    camera = Camera("tele", Prior(10.0, np.inf), None, None, distortion, frame_mm=(10.0, 7.5))
+    return nets.digital_network(camera, nets.view_rows(places, list(xyz)), xyz, 0.003)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 4])
+def test_no_picture_of_a_telephoto_lens_is_tilted_the_wrong_way(seed: int) -> None:
+    """From far away a board looks like one tilted the other way: a start with a wide field ends in wrong minima."""
+    result = adjust(telephoto_network(seed))
+    assert result.converged
+    assert abs(result.value("IO.tele.c") - 50.0) < 3.0 * result.sigma("IO.tele.c") < 5.0
+    assert 0.9 < result.sigma0 < 1.1
 
 
 @pytest.mark.parametrize(("along", "where"), [(1.0, "on one line"), (0.0, "at one place")])

@@ -257,6 +257,21 @@ def test_a_board_with_corners_outside_is_refused_in_fitting_words(large_board: t
     assert "9 x 6 inner corners is whole in the scan: some of its corners, or of the light border" in board.reason
 
 
+def test_an_oblique_board_is_found_where_its_light_falls_off() -> None:
+    """Seen at 67 degrees; the light grows seven times from the top to the bottom of the picture."""
+    tilt, turn = (cv2.Rodrigues(np.deg2rad(axis))[0] for axis in ([49.0, -45.7, 0.0], [0.0, 0.0, 87.0]))
+    camera = np.array([[390.0, 0, draw.WIDTH / 2], [0, 390.0, draw.HEIGHT / 2], [0, 0, 1]])
+    homography = np.linalg.inv(
+        camera @ np.column_stack([(tilt @ turn)[:, :2], [0, 0, 264.0]]) @ np.diag([1.0, -1.0, 1.0])
+    )
+    picture = draw.take_picture(CHESSBOARD, homography, draw.chessboard_dark(CHESSBOARD))
+    lit = picture * np.exp(np.linspace(-2.0, 0.0, draw.HEIGHT))[:, None]
+    board = measure_board(draw.make_scan(lit), CHESSBOARD)
+    errors = draw.errors_px(board, draw.read_truth(CHESSBOARD, homography))
+    assert len(errors) == 30
+    assert np.abs(errors).max() < 0.2
+
+
 @pytest.mark.parametrize("left_out", [None, 0, 1, 3])
 def test_lines_of_a_board_are_evenly_spaced_under_one_homography(left_out: int | None) -> None:
     """Of a lens with 6 % of distortion at the corner, seen at an angle; one line left out shows, wherever it is."""

@@ -442,14 +442,16 @@ def test_an_assumed_pose_needs_attention_once(measured_data: ReportData, adjuste
 
 
 @pytest.mark.parametrize(
-    ("given", "sigma", "is_problem"), [(math.nan, 9.0, True), (math.nan, 0.9, False), (9.0, 9.0, False)]
+    ("given", "sigma", "clusters", "is_problem"),
+    [(math.nan, 9.0, None, True), (math.nan, 0.9, None, False), (math.nan, 0.9, 9.0, True), (9.0, 9.0, None, False)],
 )
 def test_a_free_principal_distance_that_images_hardly_determine(
-    adjusted_data: ReportData, given: float, sigma: float, is_problem: bool
+    adjusted_data: ReportData, given: float, sigma: float, clusters: float | None, is_problem: bool
 ) -> None:
     """c is 153 mm; 9 mm are 6 % of it. A given one of that standard deviation is what the user says."""
+    prior = GivenQuantity(153.0, given)
     cameras = {
-        name: replace(camera, principal_distance_mm=Quantity(153.0, sigma, GivenQuantity(153.0, given)))
+        name: replace(camera, principal_distance_mm=Quantity(153.0, sigma, prior, sigma_clusters=clusters))
         for name, camera in present(adjusted_data.adjustment).cameras.items()
     }
     text = rendered(changed(adjusted_data, cameras=cameras)).text
