@@ -913,10 +913,12 @@ def _fit_again(frame: Frame, index: int, options: MatchOptions, linear_sigma: fl
     return detect_mark(frame.scan, expected, options, linear_sigma, begun).fit
 
 
-def detect_some(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame | None:
-    """Start a frame and detect marks spread over it, up to the first clear one; None if none of them is clear."""
+def detect_some(
+    scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions, among: Sequence[int]
+) -> Frame | None:
+    """Start a frame and detect some among its marks, spread evenly, up to a clear one; None if none is clear."""
     frame = start_frame(scan, layout, placement, options)
-    for index in range(0, len(layout.marks), max(1, len(layout.marks) // _TRIALS)):
+    for index in among[:: max(1, len(among) // _TRIALS)]:
         frame = _detect(frame, [index], frame.first_search_px)
         if frame.detections[index].is_clear:
             return frame

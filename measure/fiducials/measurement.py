@@ -16,7 +16,7 @@ from measure.fiducials.clicked_frame import clicked_frame
 from measure.fiducials.constellation import Placement
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA
 from measure.fiducials.mark_fit import Detection
-from measure.fiducials.measure_frame import Frame, measure_frame, rename_frame
+from measure.fiducials.measure_frame import Frame, detect_some, measure_frame, orient_frame, rename_frame
 from measure.fiducials.options import CLICK_SIGMA_PX, Click, FiducialOptions
 from measure.fiducials.scan_orientation import decide_scan_orientation
 from measure.fiducials.search import SearchResult
@@ -257,12 +257,28 @@ def _outdoes(frame: Frame, rival: Placement) -> bool:
 
 
 def _is_another_frame(result: SearchResult, other: Placement, frame: Frame) -> bool:
-    """Whether a placement with as many supporting marks is another frame, as in a scan of two photographs."""
-    if other.supported < frame.placement.supported or not result.is_exhaustive(other):
+    """Whether a placement with as many supporting marks is another frame, as in a scan of two photographs.
+
+    If it names all marks of this frame, these are not measured again. Else it has to show a clear mark where this frame
+    has none.
+    """
+    if not frame.inlier_fits or other.supported < frame.placement.supported or not result.is_exhaustive(other):
         return False
     if false_placements(result, other) > MAX_FALSE_FRAMES:
         return False
-    frame_there = measure_frame(frame.scan, frame.layout, other, frame.options)
+    as_given = frame.scan, frame.layout, other, frame.options
+    own = [detection for detection, is_own in zip(frame.detections, frame.inliers, strict=True) if is_own]
+    own_px = np.array([each.fit.center_px for each in own if each.fit])
+    names = other.names(own_px, frame.camera_mm).tolist()
+    if min(names) >= 0:
+        renamed = Frame.from_placement(*as_given).replace_detections(dict(zip(names, own, strict=True)))
+        renamed = orient_frame(renamed)
+        return renamed.is_sure and bool(renamed.inliers.sum() == len(own))
+    apart_px, _ = cKDTree(own_px).query(other.places_px(frame.camera_mm))
+    begun = detect_some(*as_given, np.flatnonzero(apart_px > frame.first_search_px).tolist())
+    if begun is None:
+        return False
+    frame_there = measure_frame(*as_given, begun)
     return frame_there.is_sure and not frame.contains(frame_there)
 
 

@@ -268,7 +268,8 @@ def measure_stage(
         number = tried if kind == "faint" else len(stage.hypotheses)
         places = [each for each in places if number * false_placements(result, each) <= MAX_FALSE_PLACEMENTS]
     if kind == "pitch" or stage.tone is not None:
-        begun = {each: frame for each in places if (frame := detect_some(scan, layout, each, options))}
+        every = range(len(layout.marks))
+        begun = {each: frame for each in places if (frame := detect_some(scan, layout, each, options, every))}
         places = list(begun)
     if kind == "oblique":
         needed = max(_OBLIQUE, len(layout.marks) - _MISSED)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from adjust.functional_model.transformation import FILM_NAMES, HIGHEST_ORDER, film_parameter_names
 from measure import FiducialOptions, Scan, Status
 from measure.detection.responses import ByteCache, Responses
-from measure.fiducials import consistency, stages
+from measure.fiducials import consistency, measurement, stages
 from measure.fiducials import measure_frame as steps
 from measure.fiducials.across_frames import check_frames
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, same_picture
@@ -301,7 +302,7 @@ def make_frame_chance(scan: Scan, layout: FiducialLayout) -> Frame:
 
 def test_marks_by_which_a_placement_was_tried_are_not_detected_again(monkeypatch: pytest.MonkeyPatch) -> None:
     scan, sought = make_scan(picture(DOTS, "0", hidden=0)), list[list[int]]()
-    begun = detect_some(scan, DOTS, placement("0"), OPTIONS)
+    begun = detect_some(scan, DOTS, placement("0"), OPTIONS, range(4))
     assert begun is not None
     assert [each.inside for each in begun.detections] == [True, True, False, False]  # up to the first clear one
 
@@ -314,7 +315,8 @@ def test_marks_by_which_a_placement_was_tried_are_not_detected_again(monkeypatch
     frame = detect_frame(scan, DOTS, placement("0"), OPTIONS, begun)
     assert sought == [[2, 3]]
     assert np.hypot(*(frame.inlier_fits[1].center_px - centers_px(DOTS, "0")[1])) < 0.2
-    assert detect_some(make_scan(noisy(np.full((380, 380), 20000.0))), DOTS, placement("0"), OPTIONS) is None
+    plain = make_scan(noisy(np.full((380, 380), 20000.0)))
+    assert detect_some(plain, DOTS, placement("0"), OPTIONS, range(4)) is None
 
 
 def test_three_plain_dots_of_four_are_no_chance() -> None:
@@ -322,6 +324,25 @@ def test_three_plain_dots_of_four_are_no_chance() -> None:
     frame = make_frame_chance(scan, DOTS)
     assert frame.inliers.tolist() == [True, False, True, True]
     assert doubt_frame(SearchResult(), frame) == ""
+
+
+def test_a_lattice_named_by_a_step_or_two_farther_on_is_not_measured_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lower six of nine dots are there. As the upper six they fit as well, as the left six only four of them do."""
+    lattice = lay_out([DOT] * 9, [(x, y) for y in (-7.0, 0.0, 7.0) for x in (-7.0, 0.0, 7.0)], (16.0, 16.0))
+    shown = FiducialLayout(lattice.marks[:6], lattice.frame_mm)
+    frame = make_frame_chance(make_scan(picture(shown, "0")), lattice)
+    assert frame.inliers.tolist() == [True] * 6 + [False] * 3
+    whole = cast(Any, SimpleNamespace(is_exhaustive=lambda _: True))
+    monkeypatch.setattr(measurement, "false_placements", lambda *_: 0.0)
+    monkeypatch.setattr(measurement, "measure_frame", lambda *_: pytest.fail("it is measured again"))
+
+    def moved(x: float, y: float) -> Placement:
+        matrix = placement("0").pixel_from_camera.copy()
+        matrix[:, 2] += matrix[:, :2] @ (x, y)
+        return replace(placement("0"), pixel_from_camera=matrix)
+
+    assert measurement._is_another_frame(whole, moved(0.0, -7.0), frame)
+    assert not measurement._is_another_frame(whole, moved(-7.0, 0.0), frame)
 
 
 def test_a_frame_moved_on_by_the_distance_of_two_marks_is_known_by_its_marks() -> None:
