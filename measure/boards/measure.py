@@ -35,6 +35,8 @@ from measure.targets.sheets import fit_view_robustly
 
 _MIRROR = np.array([-1.0, 1.0])  # of column and row
 _SMALLEST_DOT_PX = 5.0  # px, diameter
+_FEWEST_WIDTHS = 8  # dots: four determine how the board lies
+_LARGEST_RATIO = 1.25  # of a dot's width to the given one: tone curve and ink change small ones by a tenth
 _NEAREST_DOTS = 8  # neighbours whose places and shapes predict a missing dot
 # Reach of the window along the edges, as fractions of a square's side unless in px:
 _REACH = 0.3  # illumination, distortion and flatness change little over it
@@ -65,6 +67,7 @@ class BoardMeasurement:
     refused : markers that were read but are not used, one sentence each.
     ambiguous : further boards that look the same, so that no point is an observation.
     is_mirrored : whether the image shows the board mirrored.
+    contradiction : how the board differs from its description; "" if it does not.
     """
 
     marks: tuple[MarkMeasurement, ...]
@@ -73,6 +76,7 @@ class BoardMeasurement:
     refused: tuple[Reason, ...] = ()
     ambiguous: Reason = NO_REASON
     is_mirrored: bool = False
+    contradiction: str = ""
 
 
 def _measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> BoardMeasurement:
@@ -98,8 +102,27 @@ def _measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> BoardMeasurement:
     fits = fit_plain_disks(scan, list(starts.values()), [2 * gap / (1 - gap) * axis_px for axis_px in shorter_px])
     disks = {place: fit for place, fit in zip(starts, fits, strict=True) if fit.reason or _is_whole(scan, fit)}
     marks = [_dot_mark(name, disks.get(place), place in detected) for place, name in names.items()]
-    measured = BoardMeasurement(tuple(marks), notes=grid.notes, is_mirrored=is_mirrored)
+    wrong_width = _width_contradiction({names[place]: fit for place, fit in disks.items() if not fit.reason}, spec)
+    measured = BoardMeasurement(tuple(marks), notes=grid.notes, is_mirrored=is_mirrored, contradiction=wrong_width)
     return _unless_alone(scan, measured, f"grids of {grid_size(spec, 'dots')}", grid.others_px)
+
+
+def _width_contradiction(disks: Mapping[str, FittedDisk], spec: CircleGridSpec) -> str:
+    """Sentence where the dots, compared with their distances, are much wider or narrower than given; else empty."""
+    if len(disks) < _FEWEST_WIDTHS:
+        return ""
+    points = spec.object_points()
+    places_mm = np.array([points[name][:2] for name in disks]).reshape(-1, 2)
+    homography, _ = cv2.findHomography(places_mm, np.array([fit.center_px for fit in disks.values()]).reshape(-1, 2))
+    steps_px = np.array([homography_steps(np.asarray(homography, float), place)[1] for place in places_mm])
+    shapes_px = np.array([fit.pixel_from_disk for fit in disks.values()])
+    width_mm = 2.0 * float(np.median(np.sqrt(np.abs(np.linalg.det(shapes_px) / np.linalg.det(steps_px)))))
+    if 1.0 / _LARGEST_RATIO < width_mm / spec.diameter_mm < _LARGEST_RATIO:
+        return ""
+    return (
+        f"The board's dots are {width_mm:.2g} mm wide at a spacing of {spec.spacing_mm:g} mm, but {spec.diameter_mm:g} "
+        "mm are given: their width or the spacing is wrong. Measure both on the board."
+    )
 
 
 def _appearances(patches: list[TargetCandidate]) -> Array:

@@ -118,6 +118,8 @@ def _board(sought: SoughtTargets, spec: BoardSpec, scan: Scan, measured: Measure
         problems = [f"No point of the board is used: {board.ambiguous}. Cover all but one, or cut the scan."]
     if board.is_mirrored and not sought.settings.transparent:
         problems.append(_MIRRORED)
+    if board.contradiction:
+        problems.append(board.contradiction)
     # A board with symmetry under a half turn may be named either way, unless its points were surveyed.
     notes = [f"{note}." for note in board.notes] if sought.surveyed else []
     return replace_targets(measured, board.marks, (*problems, *notes), Code.NO_BOARD)

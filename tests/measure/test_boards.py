@@ -116,6 +116,16 @@ def test_dots_that_the_edge_of_the_picture_cuts_are_not_measured(left_px: int, c
     assert np.abs(errors).max() < 0.06
 
 
+def test_dots_of_another_width_than_given_are_named() -> None:
+    """As where the spacing is the distance of the columns of one row, twice that of an asymmetric grid."""
+    spec = specs.CircleGridSpec(8, 6, 20.0, 15.0, asymmetric=True)
+    picture = draw.make_scan(draw.take_picture(spec, draw.board_from_pixel(tilt=5e-5), draw.circles_dark(spec)))
+    twice = measure_board(picture, replace(spec, spacing_mm=40.0))
+    assert not twice.reason
+    assert "dots are 30 mm wide at a spacing of 40 mm, but 15 mm are given" in twice.contradiction
+    assert not measure_board(picture, replace(spec, diameter_mm=13.5)).contradiction
+
+
 @parametrize_with_studies("is_mirrored", [True, False])
 def test_an_asymmetric_grid_in_a_mirror_keeps_its_names(is_mirrored: bool) -> None:
     spec, homography = specs.CircleGridSpec(8, 6, 20.0, 15.0, asymmetric=True), draw.board_from_pixel(tilt=5e-5)
