@@ -361,7 +361,7 @@ def _name_cameras(
         shared.show(as_json, identification.as_json, lambda console: print_identification(identification, console))
         steps = [f'camera = "{PREFIX}{name}" in project.toml' for name in identification.names_by_plate()]
         shared.print_next(as_json, *(steps or [LIBRARY_STEP]))
-        return shared.DONE if identification.best else shared.LOOK
+        return shared.DONE if identification.best and not identification.is_likely_false else shared.LOOK
     with reporter.stage("examining file") as count:
         found = catalogue(given, count, max_pixels, by_folder=False)
     trial = partial(identify_sample, cameras=tried, pitch_um=pitch_um, max_pixels=max_pixels)

@@ -2,7 +2,7 @@
 JSON."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -271,6 +271,7 @@ class Identification:
     reports : by name, the number of calibration reports behind a camera.
     board : the calibration board in the image, as `reseau calibrate` takes it.
     is_negative : whether the scan shows the marks of the best trials with light and dark exchanged.
+    solid : names of cameras with solid marks only.
     """
 
     scan: Path
@@ -283,6 +284,7 @@ class Identification:
     reports: Mapping[str, int] = field(default_factory=dict)
     board: str = ""
     is_negative: bool = False
+    solid: Collection[str] = ()
 
     @property
     def best(self) -> tuple[Trial, ...]:
@@ -300,6 +302,11 @@ class Identification:
         by_chance = f"{first.expected:.1g} false alarms expected in such a scan"
         if first.score_elsewhere is not None:
             by_chance = f"the same marks in wrong places score {first.score_elsewhere:.2f}"
+        if self.is_likely_false:
+            return (
+                f"{self.scan.name}: no camera is named: perhaps {' or '.join(self.best_names())}, {first.found} of "
+                f"{first.drawn} marks, but that rests on the form of the marks alone. {self.against_pitch()}"
+            )
         text = (
             f"{self.scan.name}: {' or '.join(first.cameras)}, score {first.score:.2f}: {first.found} of {first.drawn} "
             f"marks, likeness {first.likeness:.2f}, signal-to-noise {first.snr:.1f}; {by_chance}."
@@ -320,13 +327,21 @@ class Identification:
         against = self.against_pitch()
         return text + self._plate_remark() + (f" {against}" if against else "")
 
+    @property
+    def is_likely_false(self) -> bool:
+        """Whether solid marks alone identify the camera, against the pitch: likely a false alarm of such marks."""
+        names = self.best_names()
+        return (
+            bool(names) and not self.plate and all(name in self.solid for name in names) and bool(self.against_pitch())
+        )
+
     def best_names(self) -> tuple[str, ...]:
         """Names of the cameras of the best trials."""
         return tuple(name for trial in self.best for name in trial.cameras)
 
     def names_by_plate(self) -> list[str]:
-        """Names of the best cameras that the plate does not contradict."""
-        return [name for name in self.best_names() if name not in self.contradicted]
+        """Names of the best cameras that neither the plate nor the pitch contradicts."""
+        return [name for name in self.best_names() if name not in self.contradicted and not self.is_likely_false]
 
     def much_alike(self) -> tuple[str, ...]:
         """Other cameras whose marks resemble those of the best trials."""
@@ -361,7 +376,12 @@ class Identification:
 
     def as_json(self) -> Mapping[str, object]:
         trials = [{**asdict(trial), "stands_out": trial.stands_out} for trial in self.trials]
-        head = {"scan": str(self.scan), "best": list(self.best_names()), "sentence": self.sentence(), "trials": trials}
+        head = {
+            "scan": str(self.scan),
+            "best": [] if self.is_likely_false else [*self.best_names()],
+            "sentence": self.sentence(),
+            "trials": trials,
+        }
         return {**head, "plate": dict(self.plate), "contradicted": sorted(self.contradicted)}
 
 

@@ -218,7 +218,10 @@ def identify(
     plate = {} if reader is None else parse_plate(read_writing(picture, reader, enough=is_whole_plate))
     against_plate = {name: contradictions(camera, plate) for name, camera in cameras.items()}
     contradicted = {name: against for name, against in against_plate.items() if against}
-    return Identification(path, ranked, unreported, given, plate, contradicted, alike, reports, is_negative=is_negative)
+    solid = {name for names, layout in layouts.items() if all(map(is_solid, layout.marks)) for name in names}
+    return Identification(
+        path, ranked, unreported, given, plate, contradicted, alike, reports, is_negative=is_negative, solid=solid
+    )
 
 
 def _layouts_like(layouts: Mapping[Names, FiducialLayout], likely: Collection[str]) -> dict[Names, FiducialLayout]:

@@ -544,6 +544,10 @@ def test_solid_marks_name_no_camera_against_the_pitch(camera: str, pixel_um: flo
     group = ScanGroup(Path(), ScanHead("TIFF", 9, 9, 1, 8, Pitch((45.0, 45.0))), (Path("a.tif"),), (sample,))
     assert group.camera == (camera if named else "")
     assert named or "contradict the file's pitch" in group.why_not()
+    solid = {"wing-large-flat-153"} & {camera}
+    alone = replace(sample, solid=solid)
+    assert alone.names_by_plate() == ([camera] if named else [])
+    assert named or "no camera is named: perhaps wing-large-flat-153, 4 of 4 marks" in alone.sentence()
 
 
 def test_wings_of_much_the_same_form_are_reported_next_to_a_name_that_rests_on_them() -> None:
