@@ -11,7 +11,7 @@ from scipy.special import comb
 
 from measure.array_types import Array, Bytes, Integers
 from measure.boards.lattice import find_squares
-from measure.boards.markers import find_aruco, find_charuco, read_any_markers
+from measure.boards.markers import are_diagonal, find_aruco, find_charuco, read_any_markers
 from measure.boards.specs import (
     ArucoSpec,
     CharucoSpec,
@@ -429,11 +429,11 @@ def recognise_board(scan: Scan) -> str:
     if reason:
         return ""
     dictionary, markers = read_any_markers(picture)
+    if len(markers) >= _FEWEST_MARKERS:
+        kind = "charuco" if are_diagonal(markers) else "aruco"
+        return f"--kind {kind} --dictionary {dictionary} --board COLUMNSxROWS --marker SIZE"
     grid = _chessboard_of_any_count(picture)
     pattern = whole_pattern(picture, _right_handed(grid)) if grid is not None else None
-    if markers >= _FEWEST_MARKERS:
-        kind = "charuco" if grid is not None else "aruco"
-        return f"--kind {kind} --dictionary {dictionary} --board COLUMNSxROWS --marker SIZE"
     if pattern is None or not is_even(pattern.grid, (picture.shape[1], picture.shape[0])):
         return ""
     rows, columns = sorted(pattern.grid.shape[:2])

@@ -8,6 +8,7 @@ from typing import Any, TypeVar, cast
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from measure.array_types import Array, Bytes
 from measure.boards.lattice import homography_steps
@@ -87,11 +88,20 @@ def read_markers(
     return MarkerReadings(readings, (picture.shape[1], picture.shape[0]), border)
 
 
-def read_any_markers(picture: Bytes) -> tuple[str, int]:
-    """Common dictionary of which most markers are read in an image, and the number of different markers."""
-    numbers = {name: len(read_markers(picture, aruco_dictionary(name)).outlines_px) for name in _COMMON_DICTIONARIES}
-    name = max(numbers, key=lambda each: numbers[each])
-    return name, numbers[name]
+def read_any_markers(picture: Bytes) -> tuple[str, Array]:
+    """Common dictionary of which most markers are read in an image, and outlines (n, 4, 2) of the different markers."""
+    outlines = {name: read_markers(picture, aruco_dictionary(name)).outlines_px for name in _COMMON_DICTIONARIES}
+    name = max(outlines, key=lambda each: len(outlines[each]))
+    return name, np.array([places[0] for places in outlines[name].values()]).reshape(-1, 4, 2)
+
+
+def are_diagonal(outlines_px: Array) -> bool:
+    """Whether most of several markers (n, 4, 2) have the nearest other one along a diagonal, as on a ChArUco board."""
+    middles = outlines_px.mean(axis=1)
+    nearest = np.asarray(cKDTree(middles).query(middles, [2])[1])[:, 0]
+    sides = np.stack([outlines_px[:, 1] - outlines_px[:, 0], outlines_px[:, 3] - outlines_px[:, 0]], axis=-1)
+    across = np.abs(np.linalg.solve(sides, (middles[nearest] - middles)[..., None])[..., 0])
+    return bool(np.median(across.min(axis=1) / across.max(axis=1)) > 0.5)
 
 
 def placed_markers(read: MarkerReadings, board: Markers) -> ReadMarkers:
