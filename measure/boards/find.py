@@ -80,10 +80,12 @@ def is_even(grid: Array, size_px: tuple[int, int], farthest: float = np.inf) -> 
             return True
     offs, view = [], fit_view_robustly(places, grid.reshape(-1, 2), size_px)
     if view is not None:
-        offs.append(np.hypot(*(view.places_px(places) - grid.reshape(-1, 2)).T).reshape(rows, columns) / steps)
-    if min(rows, columns) > _SMOOTH:
-        offs.append(np.maximum(_from_neighbours(grid), _from_neighbours(grid.swapaxes(0, 1)).T) / steps)
-    return any(off.max() < farthest and all(np.median(line) < _UNEVEN for line in (*off, *off.T)) for off in offs)
+        off = np.hypot(*(view.places_px(places) - grid.reshape(-1, 2)).T).reshape(rows, columns) / steps
+        offs.append((off, farthest))
+    if min(rows, columns) > _SMOOTH:  # the errors of five corners add up to twice that of one
+        off = np.maximum(_from_neighbours(grid), _from_neighbours(grid.swapaxes(0, 1)).T) / steps
+        offs.append((off, 2.0 * farthest))
+    return any(off.max() < most and all(np.median(line) < _UNEVEN for line in (*off, *off.T)) for off, most in offs)
 
 
 def _from_neighbours(grid: Array) -> Array:

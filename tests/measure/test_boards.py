@@ -301,15 +301,16 @@ def test_lines_of_a_board_are_evenly_spaced_under_one_homography(left_out: int |
 @pytest.mark.parametrize("left_out", [None, 1, 3])
 @pytest.mark.parametrize("off_axis_deg", [50.0, 80.0])
 def test_lines_of_a_board_are_evenly_spaced_in_a_fisheye(off_axis_deg: float, left_out: int | None) -> None:
-    """Equidistant, r = f theta, of a board that reaches to 80 and to 105 degrees from the axis."""
+    """Equidistant, r = f theta, of a board that reaches to 89 and to 119 degrees from the axis."""
     column, row = np.meshgrid(np.arange(9.0) - 4.0, np.arange(7.0) - 3.0)
     angle = np.deg2rad(off_axis_deg)
-    x, y, z = 6.0 * np.sin(angle) + column * np.cos(angle), row, 6.0 * np.cos(angle) - column * np.sin(angle)
+    x, y, z = 5.0 * np.sin(angle) + column * np.cos(angle), row, 5.0 * np.cos(angle) - column * np.sin(angle)
     away = np.arctan2(np.hypot(x, y), z) / np.hypot(x, y)
     grid = np.stack([400.0 + 200.0 * away * x, 400.0 + 200.0 * away * y], axis=-1)
     if left_out is not None:
         grid = np.delete(grid, 1 + left_out, axis=0)
-    assert is_even(grid, (801, 801)) == (left_out is None)
+        assert not is_even(grid, (801, 801))
+    assert is_even(grid, (801, 801), farthest=0.1) == (left_out is None)
 
 
 def test_a_pattern_grows_to_where_it_ends() -> None:
