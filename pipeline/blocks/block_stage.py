@@ -216,7 +216,8 @@ def _design(track: Sequence[TrackObservation]) -> Array:
 def choose_tracks(
     block: Reconstruction, pictures: Mapping[str, BlockPicture], precision: FeaturePrecision
 ) -> list[int]:
-    """Select consistent tracks for each cell of each image: the longest ones, among these the most precise."""
+    """Select consistent tracks for each cell of each image: the longest ones, among these the most precise; of those
+    that share a place, one."""
     usable = [
         number
         for number, track in block.tracks.items()
@@ -225,15 +226,18 @@ def choose_tracks(
     ]
     usable.sort(key=lambda number: (-len(block.tracks[number]), max(s.size_px for s in block.tracks[number])))
     taken: dict[tuple[str, int, int], int] = defaultdict(int)
+    places = set[tuple[str, float, float]]()  # a feature with two directions is two features at one place
     chosen = []
     for number in usable:
+        own = {(sight.image, sight.col, sight.row) for sight in block.tracks[number]}
         cells = []
         for sight in block.tracks[number]:
             picture = pictures[sight.image]
             column = int(CELLS * sight.col / picture.lattice.width_px)
             cells.append((picture.image, column, int(CELLS * sight.row / picture.lattice.height_px)))
-        if any(taken[cell] < A_CELL for cell in cells):
+        if places.isdisjoint(own) and any(taken[cell] < A_CELL for cell in cells):
             chosen.append(number)
+            places |= own
             for cell in cells:
                 taken[cell] += 1
     return sorted(chosen)

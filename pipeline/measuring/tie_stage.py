@@ -84,12 +84,13 @@ def _occupied_places(marks: Sequence[MarkMeasurement]) -> Array:
 
 
 def _check_fiducials_by_joins(scans: Sequence[MeasuredScan]) -> list[MeasuredScan]:
-    """Check the fiducials of each pair of scans against one another through the joins."""
+    """Check the fiducials of each pair of scans against one another through the joins, of other scans too."""
     result = {scan.frame.image: scan for scan in scans}
     checked = set[str]()
     for i, first in enumerate(scans):
+        from_first = _pixel_maps(first, scans)
         for second in scans[i + 1 :]:
-            off_mm = _discrepancy_mm(first, second)
+            off_mm = _discrepancy_mm(first, second, from_first.get(second.frame.image))
             if off_mm is None:
                 continue
             both = [
@@ -137,28 +138,43 @@ def _fiducials(scan: MeasuredScan) -> dict[str, Array]:
     }
 
 
-def _discrepancy_mm(first: MeasuredScan, second: MeasuredScan) -> float | None:
-    """RMS distance of the second scan's fiducials from their places by the first scan's frame and the joins, in mm.
+def _pixel_maps(first: MeasuredScan, scans: Sequence[MeasuredScan]) -> dict[str, Affine]:
+    """Similarities from the pixels of a scan to those of the scans that are joined to it, directly or by others."""
+    maps, reached = {first.frame.image: Affine(np.eye(2, 3))}, [first]
+    for scan in reached:  # grows on the way: the fewest joined scans in between
+        for other in scans:
+            if other.frame.image not in maps and (step := _similarity(scan, other)) is not None:
+                maps[other.frame.image] = step.compose(maps[scan.frame.image])
+                reached.append(other)
+    return maps
 
-    None where there are too few joins, no frame or no fiducials.
-    """
+
+def _similarity(first: MeasuredScan, second: MeasuredScan) -> Affine | None:
+    """Similarity from pixels of the first scan to the second by their joins; None where there are too few."""
     places = [
         {mark.point: mark.center_px for mark in scan.frame.marks if mark.kind == "join" and mark.status.is_observation}
         for scan in (first, second)
     ]
     common = sorted(places[0].keys() & places[1].keys())
-    frame, second_frame = first.frame.pixel_from_camera, second.frame.pixel_from_camera
-    fiducials = _fiducials(second)
-    if len(common) < _FEWEST or frame is None or second_frame is None or not fiducials:
+    if len(common) < _FEWEST:
         return None
-    # similarity from pixels of the first scan to the second, as complex numbers
-    here, there = (np.array([of[point] for point in common]) @ (1.0, 1.0j) for of in places)
+    here, there = (np.array([of[point] for point in common]) @ (1.0, 1.0j) for of in places)  # complex numbers
     scale = np.vdot(here - here.mean(), there - there.mean()) / np.vdot(here - here.mean(), here - here.mean())
     shift = there.mean() - scale * here.mean()
-    second_from_first = np.array([[scale.real, -scale.imag, shift.real], [scale.imag, scale.real, shift.imag]])
+    return Affine(np.array([[scale.real, -scale.imag, shift.real], [scale.imag, scale.real, shift.imag]]))
+
+
+def _discrepancy_mm(first: MeasuredScan, second: MeasuredScan, second_from_first: Affine | None) -> float | None:
+    """RMS distance of the second scan's fiducials from their places by the first scan's frame and the joins, in mm.
+
+    None where they are not joined, or have no frame or no fiducials.
+    """
+    frame, second_frame, fiducials = first.frame.pixel_from_camera, second.frame.pixel_from_camera, _fiducials(second)
+    if second_from_first is None or frame is None or second_frame is None or not fiducials:
+        return None
     found_px = np.array(list(fiducials.values()))
     in_first_px = Affine(frame).apply(Affine(second_frame).inverse.apply(found_px))
-    off_px = np.hypot(*(Affine(second_from_first).apply(in_first_px) - found_px).T)
+    off_px = np.hypot(*(second_from_first.apply(in_first_px) - found_px).T)
     return float(np.sqrt(np.mean(off_px**2))) / (second.frame.px_per_mm or 1.0)
 
 

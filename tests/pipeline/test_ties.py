@@ -242,6 +242,10 @@ def test_ties_are_spread_and_wrong_ones_left_out() -> None:
     crowded = {j: [replace(sight, col=1000.0 + j, row=1000.0) for sight in track] for j, track in block.tracks.items()}
     assert len(block_stage.tie_marks(replace(block, tracks=crowded), PICTURES)) == 4 * block_stage.A_CELL
     assert LATTICE.width_px / block_stage.CELLS > 100
+    twice = {**block.tracks, 100: [block.tracks[7][0], *(replace(sight, col=9.0) for sight in block.tracks[7][1:])]}
+    assert len(block_stage.tie_marks(replace(block, tracks=twice), PICTURES)) == len(
+        block_stage.tie_marks(block, PICTURES)
+    )
     wrong = {**block.tracks, 7: [replace(sight, off_px=4.0) for sight in block.tracks[7]]}
     assert "tie-7" not in {mark.point for mark in block_stage.tie_marks(replace(block, tracks=wrong), PICTURES)}
     twice = {**block.tracks, 8: [*block.tracks[8], block_stage.TrackObservation("f0", 5.0, 5.0, 4.0, 0.5)]}
@@ -502,6 +506,44 @@ def test_a_middle_scan_misses_no_fiducials_that_the_others_show() -> None:
         _, middle, _ = _check_fiducials_by_joins([left, strip("b", "", own), strip("c", "34", "q")])
         assert [each.codes for each in middle.frame.problems] == [(Code.NO_FRAME,)]
         assert scan_verdict(middle) is Verdict.POOR
+
+
+@pytest.mark.parametrize("off_mm", [0.0, 5.0])
+def test_scans_that_a_third_one_joins_check_one_another(off_mm: float) -> None:
+    """The last of three lies upside down; its frame was found where it is, or elsewhere."""
+    rng, scans = np.random.default_rng(1), []
+    places_mm = {str(i): rng.uniform(-40.0, 40.0, 2) for i in range(1, 5)} | {
+        f"j{i}": rng.uniform(-40, 40, 2) for i in range(8)
+    }
+    for name, turn, own in (
+        ("a", 0.01, "1 2 j0 j1 j2 j3"),
+        ("b", -0.02, "j0 j1 j2 j3 j4 j5 j6 j7"),
+        ("c", np.pi, "3 4 j4 j5 j6 j7"),
+    ):
+        scan, c, s = strip(name, "1", ""), 20.0 * np.cos(turn), 20.0 * np.sin(turn)
+        place = np.array([[c, s, 900.0 + 300.0 * turn], [s, -c, 800.0]])
+        marks = [
+            MarkMeasurement(
+                point,
+                "join" if point.startswith("j") else "fiducial",
+                place[:, :2] @ places_mm[point] + place[:, 2],
+                Covariance.from_noise(np.eye(2)),
+                Status.MEASURED,
+            )
+            for point in own.split()
+        ]
+        found = place + (name == "c") * off_mm * np.array([[0.0, 0.0, 20.0], [0.0, 0.0, 0.0]])
+        problems = (Reason("no check", Code.NO_CHECK),) if name != "b" else ()
+        scans.append(
+            replace(scan, frame=FrameMeasurement(name, tuple(marks), None, None if name == "b" else found, problems))
+        )
+    first, middle, last = _check_fiducials_by_joins(scans)
+    assert not middle.frame.problems
+    for scan in (first, last):
+        codes = [each.codes for each in scan.frame.problems]
+        assert codes == ([(Code.NO_CHECK,), (Code.AMBIGUOUS,)] if off_mm else [])
+        status = Status.REJECTED if off_mm else Status.MEASURED
+        assert all(mark.status is status for mark in scan.frame.marks if mark.kind == "fiducial")
 
 
 def test_one_part_tells_the_orientation_of_all(tmp_path: Path) -> None:
