@@ -455,7 +455,7 @@ def telephoto_network(seed: int) -> Network:
     rng, views = np.random.default_rng(seed), []
     grid = np.array([[25.0 * column, 25.0 * row, 0.0] for row in range(6) for column in range(9)])
     for _ in range(8):
-        turn = nets.rotation(*rng.uniform(-0.5, 0.5, 2), rng.uniform(-0.3, 0.3))
+        turn = nets.rotation(*rng.uniform((-0.5, -0.5, -0.3), (0.5, 0.5, 0.3)))
         aside, away = rng.uniform(-100.0, 100.0, 2), -2500.0 * rng.uniform(0.8, 1.2)
         x, y, z = ((grid - grid.mean(axis=0)) @ turn + [*aside, away]).T
         views.append(np.stack([-50.0 * x / z, -50.0 * y / z], axis=1))
