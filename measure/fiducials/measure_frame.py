@@ -95,6 +95,7 @@ _FAINT_SIGNIFICANCE = 2.0  # _LEAST_SIGNIFICANCE where noise hardly gives such a
 _TRIALS = 6  # about this many marks are used to choose the channels, or to test a placement
 _FEWEST_SHARPENED = 4  # clear marks for a first estimate of the sharpening: of three, one may be taken for halos
 _ROUNDS = 2  # of detecting faint marks: the first marks found improve the predictions of the others
+_RESOUGHT_PX = 0.3  # px: predictions that moved by less give the same faint marks, at places within 0.003 px
 _LEAST_REACH_PX = 3.0  # px: film deformation displaces single marks so far, however well most agree
 _FAINT_CONTRAST = 1 / 250  # fraction of full scale: less is one grey level of 8 bits, or a compression artefact
 _FAINT_SIGMA_PX = 0.75  # px, largest standard deviation of a measured faint mark
@@ -485,10 +486,11 @@ def detect_missing_marks(frame: Frame) -> Frame:
         else:
             frame = _detect_elsewhere(frame)
         frame = orient_frame(frame)
+    sought_px = np.full(frame.camera_mm.shape, np.inf)
     for _ in range(_ROUNDS):
-        if frame.is_certain_of_places:
-            film_px = max(_FAR * frame.scatter_mm / float(frame.pitch_mm.mean()), _LEAST_REACH_PX)
-            frame = orient_frame(detect_faint_marks(frame, min(frame.gate_px, film_px)))
+        if frame.is_certain_of_places and np.abs(frame.predicted_px - sought_px).max() > _RESOUGHT_PX:
+            film_px, sought_px = _FAR * frame.scatter_mm / float(frame.pitch_mm.mean()), frame.predicted_px
+            frame = orient_frame(detect_faint_marks(frame, min(frame.gate_px, max(film_px, _LEAST_REACH_PX))))
     return frame
 
 

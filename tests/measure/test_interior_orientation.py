@@ -345,6 +345,23 @@ def test_a_lattice_named_by_a_step_or_two_farther_on_is_not_measured_again(monke
     assert not measurement._is_another_frame(whole, moved(-7.0, 0.0), frame)
 
 
+@pytest.mark.parametrize(("moved_px", "times"), [(0.0, 1), (0.2, 1), (1.0, 2)])
+def test_faint_marks_are_sought_again_only_where_predictions_moved(
+    moved_px: float, times: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame, rounds = make_frame_chance(make_scan(picture(DOTS, "0")), DOTS), list[Frame]()
+
+    def move(each: Frame, _: float) -> Frame:
+        rounds.append(each)
+        return replace(each, pixel_from_camera=each.pixel_from_camera + np.array([0.0, 0.0, moved_px]))
+
+    monkeypatch.setattr(Frame, "is_certain_of_places", True)
+    monkeypatch.setattr(steps, "detect_faint_marks", move)
+    monkeypatch.setattr(steps, "orient_frame", lambda each: each)
+    steps.detect_missing_marks(frame)
+    assert len(rounds) == times
+
+
 def test_a_frame_moved_on_by_the_distance_of_two_marks_is_known_by_its_marks() -> None:
     """It has the left and the middle ones under the names of the middle and the right ones; the rest is outside."""
     layout = lay_out([DOT] * 8, (*CORNERS, (0.0, -7.0), (-7.0, 0.0), (0.0, 7.0), (7.0, 0.0)), (16.0, 16.0))
