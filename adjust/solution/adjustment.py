@@ -123,7 +123,7 @@ def adjust_unmodelled(network: Network, options: Options | None = None, pixel_mm
     plausible_mm = {each.name: PLAUSIBLE * float(np.hypot(*each.frame_mm)) for each in network.cameras}
     refitted = partial(_fit_unmodelled, options=options)
 
-    def without_contradicting(given: Network, first: Adjustment) -> Adjustment:
+    def drop_contradicting(given: Network, first: Adjustment) -> Adjustment:
         doubtful = [
             name
             for name, limit_mm in plausible_mm.items()
@@ -141,9 +141,9 @@ def adjust_unmodelled(network: Network, options: Options | None = None, pixel_mm
             return first
         found = _leave_out_contradicting(given, first, refitted, agrees, several=True)
         rest = _leave_out(given, found.left_out.keys() - first.left_out.keys()) if found is not first else None
-        return found if rest is None else without_contradicting(rest, found)  # less gross ones show only then
+        return found if rest is None else drop_contradicting(rest, found)  # less gross ones show only then
 
-    result = without_contradicting(network, refitted(network))
+    result = drop_contradicting(network, refitted(network))
     per_mm, unit = (1000.0, "µm") if pixel_mm is None else (1.0 / pixel_mm, "px")
     warnings = (
         f"Camera {name}: errors of {per_mm * sigma_mm:.3g} {unit} are not modelled, one part in "

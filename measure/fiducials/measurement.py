@@ -270,6 +270,8 @@ def _is_another_frame(result: SearchResult, other: Placement, frame: Frame) -> b
     own = [detection for detection, is_own in zip(frame.detections, frame.inliers, strict=True) if is_own]
     own_px = np.array([each.fit.center_px for each in own if each.fit])
     names = other.names(own_px, frame.camera_mm).tolist()
+    if names == list(frame.inlier_fits):  # the names that they have
+        return False
     if min(names) >= 0:
         renamed = Frame.from_placement(*as_given).replace_detections(dict(zip(names, own, strict=True)))
         renamed = orient_frame(renamed)

@@ -90,7 +90,7 @@ def measure_picture(camera: shapes.FiducialLayout, picture: Array) -> list[Measu
         (WEDGE_TO_EDGE, WEDGE_MM, False),
         (NOTCH, HALF_MM, True),
     ],
-    quick=(2,),
+    quick=(2, 3),
     ids=["beyond", "with its border", "to the edge", "notch"],
 )
 def test_border_marks_are_measured_as_elsewhere(
