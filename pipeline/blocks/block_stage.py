@@ -46,7 +46,7 @@ from pipeline.results.comparator_file import (
 )
 from pipeline.text.csv_table import csv_line
 from pipeline.text.files import file_word, path_below, write_atomically
-from pipeline.text.wording import counted
+from pipeline.text.wording import counted, listed_by_reason
 from pipeline.types import Array, Mask
 
 Picture = NDArray[np.uint8]
@@ -308,9 +308,10 @@ def run_block(
 ) -> tuple[Project, tuple[str, ...], list[str]]:
     """Orient a block by COLMAP; its adjustment is then run as for any project.
 
-    Returns the project with the block's own comparator.csv, images.csv and output; the images that COLMAP did not
-    orient; and lines about the block for the user. pitch_um: of the resampled frames; None: chosen. Raises InputError
-    where COLMAP is not installed, fiducials are not measured, COLMAP orients nothing, or control is missing.
+    Returns the project with the block's own comparator.csv, images.csv and output; the images not resampled, or
+    not oriented by COLMAP; and lines about the block for the user. pitch_um: of the resampled frames; None: chosen.
+    Raises InputError where COLMAP is not installed, fiducials are not measured, COLMAP orients nothing, or control is
+    missing.
     """
     quiet_colmap()  # fails before the resampling, which takes far longer
     if not project.comparator.exists():
@@ -325,10 +326,11 @@ def run_block(
     with _step(seconds, "resampling"):
         frames = folder / "frames"
         results = resample(project, frames, pitch_um, False, True, reporter)
-        made = {result.image for result in results if not result.problem}
+        failed = {result.image: result.problem for result in results if result.problem}
+        made = {result.image for result in results} - failed.keys()
         tasks = [task for task in resample_tasks(project, frames, pitch_um, False, FAST)[0] if task.image in made]
     if len(tasks) < 2:
-        problems = " ".join(f"{result.image}: {result.problem}." for result in results if result.problem)
+        problems = " ".join(f"{image}: {problem}." for image, problem in failed.items())
         raise InputError(f"a block needs two frames, and {len(tasks)} could be resampled. {problems}")
     cameras = {camera.name: camera for camera in project.cameras.values()}
     with _step(seconds, "pictures"):
@@ -347,11 +349,12 @@ def run_block(
     lines = [
         f"COLMAP oriented {counted(len(found.poses), 'image')}; {counted(len(ties), 'tie mark')} of "
         f"{counted(len({tie.point for tie in ties}), 'point')} are observations now.",
+        *([f"not resampled: {listed_by_reason(failed)}"] if failed else []),
         *([f"not oriented: {', '.join(left_out)}"] if left_out else []),
         *([f"{counted(len(observed), 'orientation')} of images.csv observed, and adjusted so"] if observed else []),
         *(f"{step}: {duration:.0f} s" for step, duration in seconds.items()),
     ]
-    return own, left_out, lines
+    return own, tuple(sorted({*left_out, *failed})), lines
 
 
 def check_folder(project: Project, folder: Path) -> None:

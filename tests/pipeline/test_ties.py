@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -31,7 +32,7 @@ from pipeline.exchange.incoming import fiducial_camera
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.tie_stage import _check_fiducials_by_joins, add_joins, check_tie_names
 from pipeline.resampling.canvas import FrameChain
-from pipeline.resampling.resample_stage import FAST, FrameScan, ResampleTask, resample_frame
+from pipeline.resampling.resample_stage import FAST, FrameScan, Resampled, ResampleTask, resample_frame
 from pipeline.results.comparator_file import ComparatorPoint, read_comparator, write_comparator
 from pipeline.results.measured_record import MeasuredScan
 from synthetic_images.render import render_scene
@@ -272,6 +273,25 @@ def test_poses_come_into_the_frame_of_the_control() -> None:
         np.testing.assert_allclose(station, projects.TRUTH.stations[i], atol=1e-6)
     with pytest.raises(InputError, match="2 points with coordinates"):
         block_stage.orient_by_control(mapped(), PICTURES, *control(2), rays)
+
+
+def test_frames_of_a_block_that_were_not_resampled_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A frame in parts has no film transformation before an adjustment; the others make a block without it."""
+    results = [Resampled("a", tmp_path), Resampled("b", tmp_path), Resampled("c", None, problem="it is not adjusted")]
+    replaced = {
+        "resample": results,
+        "resample_tasks": ([Mock(image=each.image, camera="K") for each in results[:2]], []),
+        "run_colmap": block_stage.Reconstruction({}, {}),
+        "write_block": Mock(given_images=None),
+        "coarse_pitch_um": None,
+    }
+    for name in ("quiet_colmap", "check_folder", "read_comparator", "write_pictures", "tie_marks", "orient_by_control"):
+        monkeypatch.setattr(block_stage, name, Mock(return_value=()))
+    for name, result in replaced.items():
+        monkeypatch.setattr(block_stage, name, Mock(return_value=result))
+    _, left_out, lines = block_stage.run_block(Mock(cameras={}), tmp_path, None, Mock())
+    assert left_out == ("c",)
+    assert "not resampled: c (it is not adjusted)" in lines
 
 
 def test_control_in_either_scan_of_a_frame_places_the_block(tmp_path: Path) -> None:
