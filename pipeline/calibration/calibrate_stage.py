@@ -46,7 +46,7 @@ from pipeline.results.stage_files import read_check
 from pipeline.stages import run_all, run_measure
 from pipeline.summary import Summary
 from pipeline.text.files import FilePath, write_atomically
-from pipeline.text.wording import counted, did_you_mean, listed_by_reason
+from pipeline.text.wording import counted, did_you_mean, listed, listed_by_reason
 from pipeline.workers import WorkOptions
 
 GENEROUS = 2.0  # factor on the unmodelled standard deviation, for lens models with larger misfit than the first
@@ -296,6 +296,13 @@ def _nothing(pictures: BoardPictureFiles, left_out: Mapping[str, str], not_calib
             f"the board was found in none of {counted(number, 'picture')}; of most: {_most_common(left_out.values())}. "
             "Check --board (inner corners of a chessboard, not squares), --kind, --dictionary, --first-id, and that "
             f"the board is in the picture{shown and f': what {first} shows fits {shown}'}."
+        )
+    if len(pictures.cameras) > 1 and all(len(camera.images) < FEWEST_PICTURES for camera in pictures.cameras):
+        sizes = listed([f"{camera.width_px} x {camera.height_px} px" for camera in pictures.cameras])
+        return (
+            f"the {number} pictures have {len(pictures.cameras)} sizes or focal lengths ({sizes}), and "
+            f"{FEWEST_PICTURES} or more of one are needed. Pictures that were cut or reduced are taken for other "
+            "cameras': give them as they were taken."
         )
     return "; ".join(f"{camera}: {why}" for camera, why in not_calibrated.items()) + (
         f" Left out: {listed_by_reason(left_out)}." if left_out else ""

@@ -444,6 +444,15 @@ def test_where_no_board_is_found_the_message_names_what_the_first_picture_shows(
     assert message.endswith("that the board is in the picture: what p0 shows fits --board 7x5.")
 
 
+def test_pictures_that_were_all_cut_are_refused_in_one_sentence() -> None:
+    cameras = tuple(CameraPictures(f"camera-{k}", 640 + k, 480, None, (f"p{k}",)) for k in range(3))
+    pictures = BoardPictureFiles({f"p{k}": Path(f"p{k}.png") for k in range(3)}, cameras, {})
+    message = calibrate_stage._nothing(pictures, {}, {camera.name: "the board is in 1 picture" for camera in cameras})
+    assert message.startswith("the 3 pictures have 3 sizes or focal lengths (640 x 480 px, 641 x 480 px, 642 x 480 px)")
+    assert "cut or reduced" in message
+    assert "in 1 picture" not in message
+
+
 def test_boards_as_project_files_have_them() -> None:
     """OpenCV's asymmetric grid of 4 x 11; Kalibr's sizes, the gap three tenths of a tag where nobody says it."""
 
