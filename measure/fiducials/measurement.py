@@ -110,7 +110,9 @@ def _search_frame(
 ) -> FrameMeasurement:
     """Search for the frame without clicks that give its place, and measure its marks."""
     found, notes = find_frame(scan, layout, pitch_um, options), tuple[str, ...]()
-    if found.frame is None and (in_negative := find_in_negative(scan, layout, pitch_um, options)):
+    # Beside the lines of a sharpened negative lie fainter ones, light and dark exchanged.
+    is_doubtful = found.frame is None or found.frame.is_faint
+    if is_doubtful and (in_negative := find_in_negative(scan, layout, pitch_um, options)):
         found, notes = in_negative, (_NEGATIVE,)
     frame, result = found.frame, found.result
     lines = _read(scan, layout, frame) if options.writing == "all" else None

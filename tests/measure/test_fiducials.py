@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
 from measure import Code, FiducialLayout, FiducialOptions, MarkShape, Status, dot, polygon, ring_cross
-from measure.fiducials.measure_frame import rename_frame
+from measure.fiducials.measure_frame import Frame, rename_frame
 from measure.fiducials.stages import find_frame
 from measure.geometry import POSES
 from measure.marks.shapes import Disk, Part, finest_detail_mm
@@ -138,6 +138,16 @@ def test_a_negative_is_measured_as_it_is() -> None:
     assert "a negative of what the camera file draws" in result.notes[0]
     positive = draw.measure_grey(draw.frame_picture(draw.NUMBERED, matrix), polarised("light"))
     assert not any("negative" in note for note in positive.notes)
+
+
+def test_a_negative_is_rather_measured_than_a_faint_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "measure.fiducials.measurement.find_frame", lambda scan, _, *more: find_frame(scan, draw.NUMBERED, *more)
+    )
+    monkeypatch.setattr(Frame, "is_faint", True)
+    matrix = draw.pixel_from_camera("0")
+    result = draw.measure_grey(20000 - draw.frame_picture(draw.NUMBERED, matrix), polarised("light"))
+    assert "a negative of what the camera file draws" in result.notes[0]
 
 
 def polarised(polarity: Literal["light", "auto"]) -> FiducialLayout:
