@@ -263,18 +263,24 @@ def _marks(data: ReportData, scans: Mapping[str, MeasuredScan]) -> Iterator[Mark
     }
     given = {(row.image, row.kind == "fiducial", row.point): row for row in data.comparator}
     joined: dict[tuple[str, bool, str], MarkMeasurement | ComparatorPoint] = {**measured, **given}
+    frame_of = {image: each.part_of for image, each in data.adjustment.images.items()} if data.adjustment else {}
+    shown = {(frame_of.get(image), *name) for (image, *name), mark in joined.items() if mark.status.is_observation}
     for key, known in joined.items():
         pixel, row, residual = measured.get(key), given.get(key), residuals.get(key)
         # Standard deviation used in the adjustment, film included; without an adjustment as measured.
         sigma_um = np.array([residual.sx_um, residual.sy_um]) if residual else None
         if residual is None and row and row.sigma_mm is not None:
             sigma_um = 1e3 * row.sigma_mm
+        reason = pixel.reason if pixel and pixel.reason == known.reason else Reason.read(known.reason, "")
+        is_clear = bool(reason.codes) or known.status.is_observation or not frame_of.get(key[0])
+        if not is_clear and (frame_of[key[0]], *key[1:]) in shown:
+            reason = Reason(reason, Code.OTHER_PART)  # a comparator file has no codes
         yield Mark(
             image=key[0],
             point=known.point,
             kind=known.kind,
             status=known.status,
-            reason=pixel.reason if pixel and pixel.reason == known.reason else Reason.read(known.reason, ""),
+            reason=reason,
             center_px=pixel.center_px if pixel else None,
             covariance=pixel.covariance if pixel else None,
             sigma_um=sigma_um,

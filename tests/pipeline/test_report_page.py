@@ -8,6 +8,7 @@ from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any, get_args
+from unittest.mock import Mock
 
 import made_up_calibration
 import numpy as np
@@ -28,6 +29,7 @@ from pipeline.report.parameters import spoken_name
 from pipeline.report.verdict import critical_w, problems_by_test, sigma0_bounds
 from pipeline.results.adjustment_record import GivenQuantity, Quantity, Sigma0Record
 from pipeline.results.assessment_record import SuspectRecord
+from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.stage_files import Check
 
 Change = Callable[[ReportData], ReportData]
@@ -588,6 +590,17 @@ def test_locked_positions_need_attention_and_recurring_ones_do_not(measured_data
     lattice = replace(measured_data, comparator=(), measurement=scans)
     assert len(frames(lattice)[0].marks) == 400
     assert judge(lattice).level == "good"
+
+
+@pytest.mark.parametrize(("frame", "is_missing"), [("f", False), (None, True)])
+def test_fiducials_that_another_scan_of_the_frame_shows_are_not_missing(frame: str | None, is_missing: bool) -> None:
+    """In a comparator file without measurement, as `reseau block` writes it: it has no codes."""
+    adjustment = Mock(residuals=(), images={name: Mock(part_of=frame) for name in "lr"})
+    shown = ComparatorPoint("l", "1", "fiducial", np.zeros(2), np.full(2, 0.005), 0.0, Status.MEASURED, "")
+    absent = ComparatorPoint("r", "1", "fiducial", None, None, 0.0, Status.ABSENT, "it lies in l")
+    left, right = frames(ReportData("Halves", [shown, absent], adjustment=adjustment))
+    assert not left.marks[0].codes
+    assert right.marks[0].needs_review is is_missing
 
 
 def test_quantities_are_called_as_in_the_tables() -> None:
