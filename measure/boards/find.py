@@ -13,6 +13,7 @@ from measure.array_types import Array, Bytes, Integers
 from measure.boards.lattice import find_squares
 from measure.boards.markers import are_diagonal, find_aruco, find_charuco, read_any_markers
 from measure.boards.specs import (
+    AprilGridSpec,
     ArucoSpec,
     CharucoSpec,
     ChessboardSpec,
@@ -430,8 +431,10 @@ def recognise_board(scan: Scan) -> str:
     picture, reason = _searchable(scan, factor)
     if reason:
         return ""
-    dictionary, markers = read_any_markers(picture)
+    dictionary, border, markers = read_any_markers(picture)
     if len(markers) >= _FEWEST_MARKERS:
+        if border == AprilGridSpec.border_modules:
+            return "--kind aprilgrid --board COLUMNSxROWS"
         kind = "charuco" if are_diagonal(markers) else "aruco"
         return f"--kind {kind} --dictionary {dictionary} --board COLUMNSxROWS --marker SIZE"
     grid = _chessboard_of_any_count(picture)

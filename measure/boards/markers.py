@@ -88,11 +88,13 @@ def read_markers(
     return MarkerReadings(readings, (picture.shape[1], picture.shape[0]), border)
 
 
-def read_any_markers(picture: Bytes) -> tuple[str, Array]:
-    """Common dictionary of which most markers are read in an image, and outlines (n, 4, 2) of the different markers."""
-    outlines = {name: read_markers(picture, aruco_dictionary(name)).outlines_px for name in _COMMON_DICTIONARIES}
-    name = max(outlines, key=lambda each: len(outlines[each]))
-    return name, np.array([places[0] for places in outlines[name].values()]).reshape(-1, 4, 2)
+def read_any_markers(picture: Bytes) -> tuple[str, int, Array]:
+    """Common dictionary of which most markers are read in an image, the width of their border in modules, and outlines
+    (n, 4, 2) of the different markers."""
+    kinds = [*((name, 1) for name in _COMMON_DICTIONARIES), (_COMMON_DICTIONARIES[-1], AprilGridSpec.border_modules)]
+    outlines = {kind: read_markers(picture, aruco_dictionary(kind[0]), kind[1]).outlines_px for kind in kinds}
+    name, border = max(outlines, key=lambda each: len(outlines[each]))
+    return name, border, np.array([places[0] for places in outlines[name, border].values()]).reshape(-1, 4, 2)
 
 
 def are_diagonal(outlines_px: Array) -> bool:

@@ -680,6 +680,7 @@ def test_a_grid_of_april_tags_has_its_corners_at_the_junctions(turn_deg: float, 
     assert all("junction_col_px" in mark.quality for mark in board.marks)
     other = measure_board(draw.make_scan(picture), replace(APRIL_GRID, first_marker=0))
     assert "but as with first_id = 5" in other.reason
+    assert recognise_board(draw.make_scan(picture)) == "--kind aprilgrid --board COLUMNSxROWS"
 
 
 @parametrize_with_studies("kind", ["aprilgrid", "charuco", "aruco"], quick=(2,))
