@@ -322,10 +322,12 @@ def absent_frame(
     if Code.NO_FIT in reason.codes:
         remedy = "compare the drawings of these marks with the scan, or set tone under [measure] in the project"
     coarse, finest_um = NO_REASON, 1000 * min(finest_detail_mm(mark.mark) for mark in layout.marks)
-    if pitch_um and finest_um < _PLAIN_PX * max(pitch_um):
+    filling_um = 1000 * max(layout.frame_mm) / max(scan.width_px, scan.height_px)
+    pixel_um, source = (max(pitch_um), "") if pitch_um else (filling_um, ", as if the frame filled the scan,")
+    if finest_um < _PLAIN_PX * pixel_um:
         coarse = Reason(
-            f"The scan may be too coarse: at {max(pitch_um):.0f} µm a pixel the finest detail of the marks, "
-            f"{finest_um:.0f} µm, is {finest_um / max(pitch_um):.1f} px wide. "
+            f"The scan may be too coarse: at {pixel_um:.0f} µm a pixel{source} the finest detail of the marks, "
+            f"{finest_um:.0f} µm, is {finest_um / pixel_um:.1f} px wide. "
             f"Scan at {finest_um / _PLAIN_PX:.0f} µm or finer.",
             Code.SMALL,
         )

@@ -246,7 +246,8 @@ def _find_in_stages(
             found = replace(found, unsure=unsure, faint=min(rejected, key=itemgetter(0), default=None))
     if found.is_taken:
         return found
-    return replace(found, frame=None, misfit=found.misfit.reword(found.misfit + _what_to_do(found)))
+    # Its placements and frames would take up memory while a negative is searched for.
+    return StageResult(misfit=found.misfit.reword(found.misfit + _what_to_do(found)))
 
 
 def measure_stage(

@@ -63,13 +63,26 @@ def test_one_mark_gives_no_frame_and_no_error() -> None:
     assert result.problems
 
 
-@pytest.mark.parametrize(("mark", "is_coarse"), [(ring_cross(0.5, 0.1, 0.8, 0.1), True), (dot(0.4), False)])
-def test_a_scan_without_a_frame_says_if_its_pixels_are_large(mark: tuple[Part, ...], is_coarse: bool) -> None:
-    """Lines of 0.1 mm at 50 µm a pixel are 2 px wide, a dot of 0.8 mm is 16 px wide."""
+@pytest.mark.parametrize(
+    ("mark", "pitch", "width"),
+    [(ring_cross(0.5, 0.1, 0.8, 0.1), True, "2.0"), (ring_cross(0.5, 0.1, 0.8, 0.1), False, "2.4"), (dot(0.4), True, "")],
+)
+def test_a_scan_without_a_frame_says_if_its_pixels_are_large(mark: tuple[Part, ...], pitch: bool, width: str) -> None:
+    """Lines of 0.1 mm at 50 µm a pixel are 2 px wide, at 42.5 µm, where a frame of 17 mm fills the scan, 2.4 px; a dot
+    of 0.8 mm is 16 px wide."""
     grain = np.random.default_rng(5).normal(8000.0, 200.0, (400, 400))
-    (problem,) = draw.measure_grey(grain, draw.lay_out([MarkShape(mark)] * 4)).problems
-    coarse = "the finest detail of the marks, 100 µm, is 2.0 px wide. Scan at 33 µm or finer."
-    assert (coarse in problem, Code.SMALL in problem.codes) == (is_coarse, is_coarse)
+    (problem,) = draw.measure_grey(grain, draw.lay_out([MarkShape(mark)] * 4), pitch=pitch).problems
+    coarse = f"the finest detail of the marks, 100 µm, is {width} px wide. Scan at 33 µm or finer."
+    assert (coarse in problem, Code.SMALL in problem.codes) == (bool(width), bool(width))
+
+
+def test_a_search_without_a_frame_keeps_nothing_but_why() -> None:
+    """Placements and frames took a fifth of the memory of a scan in which a negative was searched for after them."""
+    one, layout = (draw.lay_out([MarkShape(draw.RING_CROSS)] * n, draw.CORNERS[:n]) for n in (1, 4))
+    scan = draw.make_scan(draw.frame_picture(one, draw.pixel_from_camera("0")))
+    found = find_frame(scan, layout, (draw.PITCH_UM, draw.PITCH_UM), FiducialOptions("0"))
+    assert found.misfit
+    assert (found.frame, found.faint, found.unsure, found.result.placements) == (None, None, (), ())
 
 
 def test_the_finest_detail_of_an_outline_is_an_edge_and_no_piece_of_an_arc() -> None:
