@@ -1,6 +1,6 @@
 """Exceptions of adjust."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 
 class AdjustmentError(Exception):
@@ -12,11 +12,14 @@ class AdjustmentError(Exception):
 
 
 class UnorientedError(AdjustmentError):
-    """Error: no orientation is found for some images; reasons: one sentence by name of the image."""
+    """Error: no orientation is found for some images.
 
-    def __init__(self, reasons: Mapping[str, str]) -> None:
+    reasons: one sentence by name of the image; few: those that show too few known points for an orientation.
+    """
+
+    def __init__(self, reasons: Mapping[str, str], few: Collection[str] = ()) -> None:
         super().__init__(next(iter(reasons.values())))
-        self.reasons = dict(reasons)
+        self.reasons, self.few = dict(reasons), frozenset(few)
 
 
 class NoImageError(AdjustmentError):

@@ -321,7 +321,9 @@ def orient(
                 block.points = {point: scale * xyz for point, xyz in block.points.items()}
     missing = sorted(name for name in sights if name not in block.poses)
     if missing:
-        raise UnorientedError({name: _why_not_oriented(block, name) for name in missing})
+        known = {**block.rough, **block.points}
+        few = [name for name in missing if len(known_field(block.sights[name], known).xyz) < FEWEST]
+        raise UnorientedError({name: _why_not_oriented(block, name) for name in missing}, few)
     return block.poses, _all_points(block)
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from adjust.errors import AdjustmentError, DatumError, NoImageError, UnorientedError
 from adjust.functional_model.lens import Prior
+from adjust.functional_model.transformation import marks_needed
 from adjust.initial_values.approximations import initial_values
 from adjust.initial_values.mismatches import Mismatches, find_mismatches
 from adjust.least_squares.malloc_tuning import keep_freed_memory, pause_cycle_search
@@ -76,7 +77,8 @@ def adjust(
     -------
     Adjustment
         Images without an orientation are left out, and so are those in which some point has no image at the start, or
-        which keep the iteration from converging; all are tried again once the lens is known (`Adjustment.left_out`).
+        which keep the iteration from converging; all are tried again once the lens is known (`Adjustment.left_out`). Of
+        images with too few known points the fiducials stay.
         Given points with coordinate blunders are named where the observations do not agree because of them; robust
         estimation and data snooping start without these points.
 
@@ -219,9 +221,14 @@ class _Solver:
         except AdjustmentError:
             return None
 
-    def remainder(self, network: Network, reasons: Mapping[str, str]) -> tuple[Network, Approximations] | None:
-        """Leave out some frames; return the rest with its own approximations, None where too little is left."""
-        rest = _leave_out(network, reasons) if reasons else None
+    def remainder(
+        self, network: Network, reasons: Mapping[str, str], few: Collection[str] = ()
+    ) -> tuple[Network, Approximations] | None:
+        """Leave out some frames, but the fiducials of those with `few` known points.
+
+        Returns the rest with its own approximations, None where too little is left.
+        """
+        rest = _leave_out(network, reasons, few) if reasons else None
         start = None if rest is None else self.own_start(rest)
         return None if rest is None or start is None else (rest, start)
 
@@ -239,7 +246,7 @@ class _Solver:
         try:
             return part, self.initial_values(part), misnumbered
         except UnorientedError as error:
-            rest, reasons = self.remainder(part, error.reasons), error.reasons
+            rest, reasons = self.remainder(part, error.reasons, error.few), error.reasons
         except AdjustmentError:
             return part, None, misnumbered
         return (part, None, misnumbered) if rest is None else (*rest, misnumbered | reasons)
@@ -282,10 +289,11 @@ class _Solver:
         """Adjust with those left-out images that fit once the lens is known."""
         found, left_out = rest, rest.left_out
         if rest.converged:
-            _, start, reasons = self.orientable(_adopt_lens(network, rest))
+            oriented, start, reasons = self.orientable(_adopt_lens(network, rest))
+            oriented = replace(oriented, cameras=network.cameras)
             came = left_out.keys() - reasons.keys()
             while start is not None and came:
-                part = _leave_out(network, left_out.keys() - came)
+                part = _leave_out(oriented, left_out.keys() - reasons.keys() - came)
                 if part is None:
                     break
                 try:
@@ -297,7 +305,8 @@ class _Solver:
                     found = tried
                     break
                 came = fit
-        frames = {image.frame for image in found.network.images}
+        unoriented = found.network.unoriented
+        frames = {image.frame for image in found.network.images if image.name not in unoriented}
         return replace(found, left_out={name: reason for name, reason in left_out.items() if name not in frames})
 
     def check_whole(
@@ -560,13 +569,23 @@ def _reason(first: Adjustment, last: Adjustment, frames: Sequence[str]) -> str:
     )
 
 
-def _leave_out(network: Network, frames: Collection[str]) -> Network | None:
-    """Remove some frames and what only they show from a network; None where no more than half of it would remain."""
+def _leave_out(network: Network, frames: Collection[str], few: Collection[str] = ()) -> Network | None:
+    """Remove some frames and what only they show from a network; None where no more than half of it would remain.
+
+    few: those whose fiducials stay, where these suffice for the film transformation.
+    """
     left = {image.frame for image in network.images if image.frame not in frames}
     if len(left) <= len(frames):
         return None
-    images, observations = tuple(image for image in network.images if image.frame in left), network.observations
-    names = {image.name for image in images}
+    observations, fiducials = network.observations, defaultdict[str, set[str]](set)
+    for row in np.flatnonzero(observations.has_kind("fiducial")):
+        fiducials[network.image_by_name[observations.image[row]].frame].add(observations.point[row])
+    film = {
+        image.name
+        for image in network.images
+        if image.frame in few and len(fiducials[image.frame]) >= max(marks_needed(image.transformation), 1)
+    }
+    names = {image.name for image in network.images if image.frame in left}
     shown = np.isin(observations.image, list(names))
     frames_of = defaultdict[str, set[str]](set)
     for row in np.flatnonzero(shown & ~observations.is_fiducial):
@@ -576,10 +595,12 @@ def _leave_out(network: Network, frames: Collection[str]) -> Network | None:
         for point in network.points
         if len(frames_of[point.id]) >= (FEWEST_RAYS if point.X is point.Y is point.Z is None else 1)
     }
-    kept = shown & (observations.is_fiducial | np.isin(observations.point, list(located)))
+    kept = (shown & np.isin(observations.point, list(located))) | (
+        observations.is_fiducial & np.isin(observations.image, list(names | film))
+    )
     return replace(
         network,
-        images=images,
+        images=tuple(image for image in network.images if image.name in names | film),
         points=tuple(
             point for point in network.points if point.id in located or point.id not in network.observed_points
         ),

@@ -68,7 +68,8 @@ class Adjustment(estimates.Estimates, PlottedResult):
     remarks : remarks on how the result was obtained; listed first among the warnings.
     coordinate_blunders : by given point, a sentence on the blunder that prevents agreement or a solution; other
         suspects are then consequences of these.
-    left_out : reasons by name of the images without an orientation; `network` has the others.
+    left_out : reasons by name of the images without an orientation; `network` has the others, and of those with too few
+        known points the fiducials.
     unmet : sentences by name of the points whose rays do not meet; `network` has the others.
     misread : sentences on mirrored images; other contradictions are then consequences of these.
     unused : notes on input that is not used; listed first among the notes.
@@ -260,7 +261,9 @@ class Adjustment(estimates.Estimates, PlottedResult):
 
         Where coordinate blunders prevent a solution, the warnings on the run are dropped as consequences of these.
         """
-        left_out = (f"Left out of the adjustment: {reason}" for reason in dict.fromkeys(self.left_out.values()))
+        on_film = {image.frame for image in self.network.images}
+        titles = "Left out of the adjustment", "Not oriented; its film transformation is adjusted from its fiducials"
+        left_out = dict.fromkeys(f"{titles[frame in on_film]}: {reason}" for frame, reason in self.left_out.items())
         own = (
             ()
             if self.coordinate_blunders and not self.converged

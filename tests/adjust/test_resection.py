@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from studies import parametrize_with_studies
 
 from adjust import AdjustmentError, Camera, Distortion, Network, Options, Prior, adjust, approximate
+from adjust.functional_model.transformation import film_kind
 from adjust.initial_values import resection
 from adjust.initial_values.model_formation import absolute_orientation
 from adjust.initial_values.pose import KnownField, Pose, image_distances, intersect
@@ -330,6 +331,20 @@ def test_an_image_that_the_others_do_not_help_is_named() -> None:
     few = nets.keep_rows(network, lambda image, point, _: point not in others if image == "f3" else point != third)
     with pytest.raises(AdjustmentError, match="image f3 sees 2 known points; resection needs 3"):
         approximate(few)
+
+
+def test_a_frame_with_three_known_points_keeps_its_film_transformation() -> None:
+    """It takes the marks that were scanned to the given ones."""
+    truth = nets.project_field(nets.relief_field(300.0), nets.CONVERGENT_STATIONS).network
+    of_f3 = nets.keep_rows(truth, lambda image, _, kind: (image, kind) == ("f3", "target")).observations.point
+    result = adjust(nets.keep_rows(truth, lambda image, point, _: image != "f3" or point not in of_f3[3:]))
+    assert result.converged
+    (warning,) = [each for each in result.warnings if "f3" in each]
+    assert warning.startswith("Not oriented; its film transformation is adjusted from its fiducials: image f3 sees 3 ")
+    own = nets.keep_rows(result.network, lambda image, *_: image == "f3").observations
+    assert own.point == tuple(nets.SIX_MARKS_MM)
+    film = film_kind("affine").apply(result.approximations.transformation["f3"], own.xy_mm)
+    np.testing.assert_allclose(film, list(nets.SIX_MARKS_MM.values()), atol=0.02)
 
 
 def test_misnumbered_points_are_not_believed() -> None:
