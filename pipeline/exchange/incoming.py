@@ -62,11 +62,15 @@ def read_xml(path: Path) -> Element:
 
 
 def child_text(element: Element, name: str, path: Path) -> str:
-    """Text of a child element. Raises InputError where there is none."""
-    found = element.find(name)
-    if found is None or found.text is None:
+    """Text of the one child element of a name. Raises InputError where there is none, or several."""
+    found = element.findall(name)
+    if len(found) > 1:
+        raise InputError(
+            f"{path}: <{element.tag}> has {len(found)} times <{name}>; once is right. Remove the wrong one."
+        )
+    if not found or found[0].text is None:
         raise InputError(f"{path}: <{element.tag}> has no <{name}>. Is it a file of this format?")
-    return found.text.strip()
+    return found[0].text.strip()
 
 
 def child_numbers(element: Element, name: str, count: int, path: Path) -> list[float]:

@@ -9,7 +9,15 @@ from pipeline.adjusting.picture_turn import NOT_TURNED
 from pipeline.errors import InputError
 from pipeline.exchange.block import ImageBlock, OutFrame
 from pipeline.exchange.formats import Convention, ExportOptions, Written
-from pipeline.exchange.incoming import ImportOptions, Incoming, child_numbers, opencv_camera, read_xml, xml_text
+from pipeline.exchange.incoming import (
+    ImportOptions,
+    Incoming,
+    child_numbers,
+    child_text,
+    opencv_camera,
+    read_xml,
+    xml_text,
+)
 from pipeline.exchange.micmac_format import TURNED, camera_box
 from pipeline.exchange.pinhole import BROWN, FittedLens, checked_misfits, sheared_lens
 from pipeline.files.camera_file import CameraFile
@@ -25,6 +33,7 @@ METASHAPE = Convention(
     "calibrateFiducials(resolution in mm), Marker.Type.Fiducial",
 )
 _MOST_REASONS = 3  # largest number in a message
+_OTHER_TERMS = ("k4", "p3", "p4")  # of its lens, which no family here has
 NAMES = ("f", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "b1", "b2")
 
 
@@ -140,19 +149,16 @@ def _read_camera(path: Path, options: ImportOptions) -> CameraFile:
     root = read_xml(path)
     if root.tag != "calibration":
         raise InputError(f"{path}: its root is <{root.tag}>, not <calibration>. Save it as Agisoft XML.")
-    projection = (root.findtext("projection") or "frame").strip()
+    projection = "frame" if root.find("projection") is None else child_text(root, "projection", path)
     if projection != "frame":
         raise InputError(f"{path}: is of a {projection} camera; only frame cameras are read.")
-    names = ("width", "height", *NAMES)
+    names = ("width", "height", *NAMES, *_OTHER_TERMS)
     given = {name: child_numbers(root, name, 1, path)[0] for name in names if root.find(name) is not None}
     missing = [name for name in ("width", "height", "f") if not given.get(name, 0.0) > 0.0]
     if missing:
         raise InputError(f"{path}: has no positive {missing[0]}. Export the calibration again.")
-    lost = [
-        f"{child.tag} is {(child.text or '').strip()}"
-        for child in root
-        if child.tag not in names and _is_set(child.text)
-    ]
+    lost = [f"{name} is {given[name]:g}" for name in _OTHER_TERMS if given.get(name)]
+    lost += [f"{child.tag} is {child.text}" for child in root if child.tag not in names and _is_set(child.text)]
     if lost:
         raise InputError(
             f"{path}: {lost[0]}, and no family of distortion here has it. Calibrate again with it held at 0."

@@ -121,6 +121,7 @@ def test_cameras_of_rectified_frames_come_back_together(format: str, project: Pa
     assert "from the folder of project.toml" in " ".join((folder / "README.txt").read_text().split())
 
 
+METASHAPE = "<calibration><width>9</width><height>9</height><f>3</f>{}</calibration>"
 MARK = "<OneMesureAF1I><NamePt>1</NamePt><PtIm>{}</PtIm></OneMesureAF1I>"
 MARKS = f"<MesureAppuiFlottant1Im><NameIm>a</NameIm>{MARK}</MesureAppuiFlottant1Im>"
 PIXELS = "%YAML:1.0\n---\nK: !!opencv-matrix {{rows: 3, cols: 3, dt: d, data: [9, 0, 5, 0, 9, 5, 0, 0, 1]}}\n{}\n"
@@ -147,8 +148,10 @@ ENTITIES = '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]><a>&c
         ("opencv", "%YAML:1.0\n---\nK: 5\n", "K is no matrix"),
         ("opencv", "no yaml \x01 at all", "cv2.FileStorage"),
         ("metashape", "<calibration><width>10</width><height>9</height><f>-3</f></calibration>", "no positive f"),
-        ("metashape", "<calibration><width>9</width><height>9</height><f>3</f><k4>1</k4></calibration>", "k4 is 1"),
-        ("metashape", "<calibration><width>9</width><height>9</height><f>3</f><p3>2</p3></calibration>", "p3 is 2"),
+        ("metashape", METASHAPE.format("<k4>1</k4>"), "k4 is 1"),
+        ("metashape", METASHAPE.format("<p3>2</p3>"), "p3 is 2"),
+        ("metashape", METASHAPE.format("<k4>O.1</k4>"), "a.xml: <k4> is 'O.1'; it should be 1 number"),
+        ("metashape", METASHAPE.format("<k1>1</k1><k1>2</k1>"), "a.xml: <calibration> has 2 times <k1>; once is right"),
         ("metashape", "<calibration><projection>fisheye</projection></calibration>", "only frame cameras"),
         ("opencv", PIXELS.format("distortion_model: inverse_brown_conrady"), "inverse_brown_conrady, is none of"),
         ("opencv", PIXELS.format("xi: 0.8"), "omnidirectional (xi), is none of"),
