@@ -52,6 +52,7 @@ CHECKED = 10  # smallest redundancy for an explanation
 ROUNDS = 3  # rounds of explanations, each in addition to those before
 MOST_ADJUSTED = 4  # hypotheses adjusted per round
 LEFT = 0.5  # fraction of the excess of v'Pv over its redundancy, or of what is unmodelled, that may remain
+SECOND_ORDER = 0.05  # of the variance: what displacements of images, linear in their unknowns, may leave of an effect
 WORTH = 0.3  # fraction of the largest first-order decrease above which a hypothesis is adjusted
 STEPS = 40  # images of another pitch need about 20
 LEAST_SHARE = 0.05  # of v'Pv; further lens terms remove up to 0.02 on real boards
@@ -102,7 +103,7 @@ def explain(
     first = last = before = _Model(run, redundancy, probabilities, unmodelled)
     found: list[Explanation] = []
     for _ in range(ROUNDS):
-        if found and not last.exceeds(probabilities.family):
+        if found and (not last.exceeds(probabilities.family) or last.leaves_second_order(first)):
             break
         alike, has_rival = _best(last)
         if len(alike) == 1 and alike[0].hypothesis:
@@ -123,7 +124,8 @@ def explain(
             last = _separate_lenses(last) or last
         if len(alike) > 1 or last.kind in ENDING:
             break
-    noises = (_added_noise(last.run, last.redundancy), _wide_control(last.run)) if last.exceeds(LEVEL) else ()
+    is_noise = last.exceeds(LEVEL) and not last.leaves_second_order(first)
+    noises = (_added_noise(last.run, last.redundancy), _wide_control(last.run)) if is_noise else ()
     for words, with_noise, widened in filter(None, noises):
         noisy = replace(last, run=with_noise)
         if not last.gross_errors or (not noisy.gross_errors and noisy.vpv + widened < last.criterion(1.0)):
@@ -161,6 +163,10 @@ class _Model:
     def exceeds(self, level: float) -> bool:
         """Whether v'Pv is significant at a level (chi-square test)."""
         return bool(chdtrc(self.redundancy, self.vpv) < level)
+
+    def leaves_second_order(self, first: "_Model") -> bool:
+        """Whether what is left of the first residuals may be the second order of displaced images."""
+        return self.kind in OF_IMAGES and self.variance < SECOND_ORDER * first.variance
 
     @cached_property
     def _snooping(self) -> Snooping:

@@ -241,11 +241,11 @@ def _too_large(adjustment: AdjustmentRecord) -> Iterator[ReportedProblem]:
             )
         return
     model = "add distortion parameters" if is_calibrated else "choose a richer film transformation"
-    yield ReportedProblem(
-        f"{size} ({_group_sigmas(adjustment)}).",
-        f"Reject gross errors first; then {model}, or state {noise} under [adjust]. All σ are multiplied by σ₀.",
-        section="reliability",
-    )
+    further = f"{model}, or state {noise} under [adjust]"
+    remedy = f"Reject gross errors first; then {further}. All σ are multiplied by σ₀."
+    if adjustment.warnings:
+        remedy = f"Mend what is named above first; if σ₀ stays large, {further}."
+    yield ReportedProblem(f"{size} ({_group_sigmas(adjustment)}).", remedy, section="reliability")
 
 
 def _group_sigmas(adjustment: AdjustmentRecord) -> str:

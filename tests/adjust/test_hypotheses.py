@@ -62,6 +62,16 @@ def test_nothing_else_is_blamed_with_a_stale_distortion(seed: int) -> None:
     assert result.explanations == ()
 
 
+def test_what_a_large_effect_leaves_is_blamed_on_nothing_else() -> None:
+    """Displacements have the size of the first order. Decentering, groups of images and a jump had been named, too."""
+    kind = replace(SOUND, free=(), lens={})
+    effects = faults.Effects(k1=-0.25)
+    given = faults.misfit_network(faults.scene(4, flat=True), effects, kind, np.random.default_rng(4))
+    (found,) = adjust(given).explanations
+    assert found.kind == "radial"
+    assert found.sigma0[0] > 10.0 * found.sigma0[1]
+
+
 def test_a_jump_is_found_where_it_is() -> None:
     """Pixels that are not square, or a shear, had been blamed."""
     made = faults.scene(3, flat=True)

@@ -380,6 +380,7 @@ PARTLY = (replace(NOT_SQUARE[0], sigma0=(9.6, 4.2)),)
     ("values", "words"),
     [
         ({"sigma0": 1.6}, ["σ₀ = 1.60 is above 1.11", "film_sigma_um", "(target 1.02, fiducial 0.97)"]),
+        ({"sigma0": 1.6, "warnings": ("a is mirrored.",)}, ["a is mirrored.", "Mend what is named above first; if σ₀"]),
         ({"sigma0": 1.6, "explanations": NOT_SQUARE}, ["deviations given. The pixels are not square. Give b1."]),
         ({"explanations": NOT_SQUARE}, ["The pixels are not square. Give b1."]),
         ({"sigma0": 9.6, "explanations": PARTLY}, ["Give b1.", "σ₀ = 4.2 remains with that", "state film_sigma_um"]),
