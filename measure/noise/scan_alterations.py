@@ -37,6 +37,7 @@ _MOST_SIGMAS = 6.0  # jumps are limited to as many: single ones may be anything
 _OUTLYING, _MOST_OUTLYING = 3.0, 100  # standard deviations of rows whose distances are tried, and their largest number
 _DISTANCES = 8  # that are tried, those between most of these rows
 _SIGNIFICANT = 5.0  # standard deviations of a regular jump: film, compressed, sharpened or clipped, reaches 4.5
+_MEDIAN = 2.5  # the same of the median jump, which regular ones have at 3.9 and more; marks at regular places: 1.3
 _BLOCK_PX = 8  # of JPEG, whose grid rows and columns show as well
 _FEW_BLOCKS = 5  # at fewer, thirds of blocks show, too
 _PERIODS, _ALL_NEAR = 16384, 7  # frequencies of the roughness that are sampled, and how many of them a line is wide
@@ -192,7 +193,7 @@ def _are_regular(jumps: list[Array], least_px: int = _LEAST_DISTANCE_PX, block_p
         for distance in np.arange(least, least + 1, least / most) if pairs[least] else ():
             blocks = distance / block_px
             on_grid = blocks > 0 and abs(blocks - round(blocks)) < distance / most
-            if not on_grid and all(_regular_jump(each, distance) > _SIGNIFICANT for each in jumps):
+            if not on_grid and all(_jump_regularly(each, distance) for each in jumps):
                 return True
     return False
 
@@ -206,11 +207,14 @@ def _distance_counts(jumps: Array, least: int, longest: int) -> Array:
     return np.bincount(distances[own], minlength=longest + 2).astype(float)
 
 
-def _regular_jump(jumps: Array, distance: float) -> float:
-    """Largest mean jump of rows at a distance from one another, in its standard deviations."""
+def _jump_regularly(jumps: Array, distance: float) -> bool:
+    """Whether rows at a distance from one another jump significantly on average, and most of them do: of the rows that
+    cross marks at regular places a few jump far."""
     steps = int(len(jumps) / distance)
     firsts = np.floor(np.arange(steps) * distance).astype(int)
-    return float(jumps[firsts[:, None] + np.arange(int(distance))].sum(axis=0).max() / np.sqrt(steps))
+    own = jumps[firsts[:, None] + np.arange(int(distance))] * np.sqrt(steps)
+    own = own[:, own.mean(axis=0).argmax()]
+    return bool(own.mean() > _SIGNIFICANT and np.median(own) > _MEDIAN)
 
 
 def _is_interpolated(strips: tuple[Single, Single]) -> bool:

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
-from measure import Code, FiducialLayout, FiducialOptions, MarkShape, Status, dot, polygon, ring_cross
+from measure import Code, FiducialLayout, FiducialOptions, MarkShape, Status, dot, polygon
 from measure.fiducials.measure_frame import Frame, rename_frame
 from measure.fiducials.stages import find_frame
 from measure.geometry import POSES
@@ -64,8 +64,7 @@ def test_one_mark_gives_no_frame_and_no_error() -> None:
 
 
 @pytest.mark.parametrize(
-    ("mark", "pitch", "width"),
-    [(ring_cross(0.5, 0.1, 0.8, 0.1), True, "2.0"), (ring_cross(0.5, 0.1, 0.8, 0.1), False, "2.4"), (dot(0.4), True, "")],
+    ("mark", "pitch", "width"), [(draw.RING_CROSS, True, "2.0"), (draw.RING_CROSS, False, "2.4"), (dot(0.4), True, "")]
 )
 def test_a_scan_without_a_frame_says_if_its_pixels_are_large(mark: tuple[Part, ...], pitch: bool, width: str) -> None:
     """Lines of 0.1 mm at 50 µm a pixel are 2 px wide, at 42.5 µm, where a frame of 17 mm fills the scan, 2.4 px; a dot

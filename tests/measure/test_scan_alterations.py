@@ -6,10 +6,20 @@ from functools import lru_cache
 import cv2
 import numpy as np
 import pytest
-from drawn import ALIKE, PITCH_UM, Array, center, frame_picture, make_scan, measure_grey, pixel_from_camera
+from drawn import (
+    ALIKE,
+    PITCH_UM,
+    Array,
+    brute_picture,
+    center,
+    frame_picture,
+    make_scan,
+    measure_grey,
+    pixel_from_camera,
+)
 from scipy.ndimage import convolve, gaussian_filter
 
-from measure import Code, Status, measure_fiducials
+from measure import Code, MarkShape, Status, measure_fiducials, ring_cross
 from measure.flags import Cause
 from measure.noise.scan_alterations import find_alterations
 
@@ -139,6 +149,19 @@ def test_the_lines_of_a_reseau_are_no_enlargement() -> None:
     lines = np.clip(2.0 - across, 0.0, 1.0)
     picture = 180.0 - 36.0 * np.maximum.outer(lines, lines)
     assert not causes(picture + np.random.default_rng(8).normal(0.0, 1.5, picture.shape))
+
+
+def test_large_marks_at_regular_places_are_no_enlargement() -> None:
+    """Between their lines a few rows of even noise are more alike than those around, at the same distances in both."""
+    apart, half = 250, 133
+    place = np.array([[1.0, 0.0, half + 0.3], [0.0, -1.0, half + 0.3]])
+    mark = brute_picture(MarkShape(ring_cross(50.0, 6.25, 65.0, 6.25, angle_deg=45.0)), place, 267, 267, 1.0)
+    picture = 80.0 + np.random.default_rng(1).normal(0.0, 0.6, (825, 825))
+    for row in range(3):
+        for col in range(3):
+            if (row, col) != (1, 1):
+                picture[29 + apart * row :, 29 + apart * col :][:267, :267] += 60.0 * mark
+    assert find_alterations(make_scan(256 * picture)) == []
 
 
 def test_marks_of_a_scan_turned_with_nearest_neighbours_may_be_half_a_pixel_off() -> None:
