@@ -265,6 +265,7 @@ MMVII = Convention(
     "column right, row down; Sigma2 is the covariance xx xy yy in px",
     "micmac, MMVII/src/Sensors/Measures.cpp (Name, Pt, Sigma2; SetMesIm, NameIm, Measures) and cGenerateTarget.cpp",
 )
+_NO_SIGMA2 = [-1.0, 0.0, -1.0]  # MMVII's own for a mark without one
 _FOLDERS = {True: "Fiducials", False: "Targets"}
 
 
@@ -305,10 +306,14 @@ def import_mmvii(paths: Sequence[Path], options: incoming.ImportOptions) -> inco
         image = image_name(_unquote(incoming.child_text(measures, "NameIm", path)))
         for element in measures.iterfind("Measures/el"):
             place = np.array(incoming.child_numbers(element, "Pt", 2, path)) - MMVII.first_pixel_px
-            xx, xy, yy = incoming.child_numbers(element, "Sigma2", 3, path)
-            known = xx > 0.0 and yy > 0.0 and xx * yy > xy * xy
-            covariance = np.array([[xx, xy], [xy, yy]]) if known else None
             name = _unquote(incoming.child_text(element, "Name", path))
+            xx, xy, yy = sigma2 = incoming.child_numbers(element, "Sigma2", 3, path)
+            if sigma2 != _NO_SIGMA2 and not (xx > 0.0 and yy > 0.0 and xx * yy > xy * xy):
+                raise InputError(
+                    f"{path}: <Sigma2> of mark {name!r} is {xx:g} {xy:g} {yy:g}; a covariance xx xy yy in px² has "
+                    "positive xx and yy, and xy² < xx yy. Correct it; -1 0 -1 leaves it to --sigma-px."
+                )
+            covariance = None if sigma2 == _NO_SIGMA2 else np.array([[xx, xy], [xy, yy]])
             marks.append(incoming.ForeignMark(image, name, "fiducial" if is_fiducial else "target", place, covariance))
     return incoming.Incoming(tuple(marks))
 

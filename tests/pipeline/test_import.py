@@ -124,6 +124,10 @@ def test_cameras_of_rectified_frames_come_back_together(format: str, project: Pa
 METASHAPE = "<calibration><width>9</width><height>9</height><f>3</f>{}</calibration>"
 MARK = "<OneMesureAF1I><NamePt>1</NamePt><PtIm>{}</PtIm></OneMesureAF1I>"
 MARKS = f"<MesureAppuiFlottant1Im><NameIm>a</NameIm>{MARK}</MesureAppuiFlottant1Im>"
+MESIM = (
+    "<Root><Data><SetMesIm><NameIm>a.tif</NameIm><Measures><el><Name>p</Name><Pt>1 2</Pt><Sigma2>{}</Sigma2></el>"
+    "</Measures></SetMesIm></Data></Root>"
+)
 PIXELS = "%YAML:1.0\n---\nK: !!opencv-matrix {{rows: 3, cols: 3, dt: d, data: [9, 0, 5, 0, 9, 5, 0, 0, 1]}}\n{}\n"
 POSE = (
     "R: !!opencv-matrix {{rows: {}, cols: {}, dt: d, data: [{}]}}\n"
@@ -145,6 +149,10 @@ ENTITIES = '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]><a>&c
         ("micmac", "<a/>", "has no <MesureAppuiFlottant1Im>"),
         ("micmac", MARKS.format("1 x"), "should be 2 numbers"),
         ("micmac", MARKS.format("1 nan"), "should be 2 numbers"),
+        *(
+            ("mmvii", MESIM.format(s), f"<Sigma2> of mark 'p' is {s}; a covariance")
+            for s in ("0 0 0", "1 5 1", "-4 0 -1")
+        ),
         ("opencv", "%YAML:1.0\n---\nK: 5\n", "K is no matrix"),
         ("opencv", "no yaml \x01 at all", "cv2.FileStorage"),
         ("metashape", "<calibration><width>10</width><height>9</height><f>-3</f></calibration>", "no positive f"),
@@ -180,6 +188,13 @@ def test_wrong_files_are_refused(format: str, text: str, words: str, tmp_path: P
     assert command("import", format, file, tmp_path / "o", *PITCH, "--sigma-px", "1") == WRONG_INPUT
     assert words in capfd.readouterr().err
     assert not (tmp_path / "o").exists()
+
+
+def test_a_mark_of_mmvii_without_a_covariance_takes_the_given_one(tmp_path: Path) -> None:
+    (tmp_path / "MesIm-a.xml").write_text(MESIM.format("-1 0 -1"))
+    folder = imported("mmvii", [tmp_path / "MesIm-a.xml"], tmp_path, "--pitch-um", "10", "--sigma-px", "0.2")
+    (mark,) = read_comparator(folder / "comparator.csv")
+    np.testing.assert_allclose(np.array([mark.sigma_mm], float), 0.002)
 
 
 def test_matrices_without_a_type_and_empty_ones_are_read(tmp_path: Path) -> None:
