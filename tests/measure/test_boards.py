@@ -523,15 +523,15 @@ def generated(spec: specs.CharucoSpec) -> NDArray[np.uint8]:
 
 
 @pytest.mark.parametrize("kind", ["aruco", "charuco"])
-def test_the_kind_of_a_board_is_told_from_its_markers(kind: str) -> None:
+def test_recognise_board_names_the_kind_from_the_markers(kind: str) -> None:
     """By OpenCV's own drawings; a small chessboard beside them, or the edges of markers, make no ChArUco board."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_250)
     grid = cv2.aruco.GridBoard((4, 3), 40.0, 10.0, dictionary)
     board = grid if kind == "aruco" else cv2.aruco.CharucoBoard((6, 5), 40.0, 30.0, dictionary)
     markers = board.generateImage((250, 200), marginSize=10)
-    beside = np.kron(np.indices((5, 5)).sum(axis=0) % 2 * 180 + 40, np.ones((10, 10)))
+    chessboard = np.kron(np.indices((5, 5)).sum(axis=0) % 2 * 180 + 40, np.ones((10, 10)))
     picture = np.full((220, 330), 230.0)
-    picture[10:210, 10:260], picture[75:125, 270:320] = markers, beside
+    picture[10:210, 10:260], picture[75:125, 270:320] = markers, chessboard
     scan = draw.make_scan(gaussian_filter(picture, 0.6) * 256.0)
     assert recognise_board(scan).startswith(f"--kind {kind} --dictionary 6X6_250")
 
