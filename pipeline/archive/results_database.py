@@ -17,10 +17,13 @@ from typing import Any, NamedTuple
 
 from measure.results import MEASURE_REVISION
 from pipeline.archive.schema import (
+    APPLICATION,
     COLUMNS,
     MARKS,
+    THUMBNAILS,
     DamagedError,
     Database,
+    application_id,
     damaged_result,
     is_result_sound,
     is_sound,
@@ -38,7 +41,6 @@ from pipeline.results.measured_record import (
     scan_location,
 )
 
-_SQLITE = b"SQLite format 3"  # its files begin with it
 _PLACE = "project folder"
 _MOVED = "moved-result"
 _LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "tifffile", "imagecodecs")
@@ -349,14 +351,12 @@ class Merged(NamedTuple):
 
 
 def check_mergeable(path: Path, others: Sequence[Path]) -> None:
-    """Raise InputError for a file that is no database, or the store at `path` itself, before anything is written."""
+    """Raise InputError for files that are no results databases, or the one at `path`, before anything is written."""
     for other in others:
-        head = b""
-        if other.is_file():
-            with other.open("rb") as file:
-                head = file.read(len(_SQLITE))
-        if head != _SQLITE:
+        owner = application_id(other)
+        if owner != APPLICATION:
             what = "is no" if other.exists() else "there is no such"
+            what = "holds thumbnails and is no" if owner == THUMBNAILS else what
             raise InputError(f"{other}: {what} results database. Name the out/measurement.K-of-N.db of each part.")
         if other.resolve() == path.resolve():
             raise InputError(f"{other}: is the results database that the others are joined into. Name the others only.")

@@ -20,7 +20,8 @@ from pipeline.results.measured_record import MARK_COLUMNS
 
 # Of damaged files: even SQLite's message may be undecodable, which sqlite3 may also tell by a SystemError.
 DATABASE_ERRORS = (sqlite3.Error, UnicodeDecodeError, SystemError)
-APPLICATION = 0x52455345  # "RESE": identifies the file for `file` and this program
+APPLICATION, THUMBNAILS = 0x52455345, 0x52455354  # "RESE", "REST": identify the files for `file` and this program
+_SQLITE = b"SQLite format 3"  # its files begin with it
 MARKS = ", ".join(("number", *MARK_COLUMNS))
 
 _CHECKED_MARKS = """
@@ -387,6 +388,18 @@ def open_database(path: Path, schema: Schema = MEASUREMENTS) -> sqlite3.Connecti
             raise _database_error(path, schema, error) from error
         raise
     return connection
+
+
+def application_id(path: Path) -> int:
+    """SQLite's application id of a file; 0 where there is none, or no such file."""
+    if not path.is_file():
+        return 0
+    with path.open("rb") as file:
+        if file.read(len(_SQLITE)) != _SQLITE:
+            return 0
+    with closing(_connection(path)) as connection, suppress(*DATABASE_ERRORS):
+        return int(connection.execute("pragma application_id").fetchone()[0])
+    return 0
 
 
 def _connection(path: Path) -> sqlite3.Connection:

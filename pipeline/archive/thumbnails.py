@@ -14,7 +14,7 @@ from measure.errors import MeasurementError
 from measure.scans.opening import open_scan
 from measure.scans.remote import scan_path
 from measure.scans.scan import Scan
-from pipeline.archive.schema import DATABASE_ERRORS, Database, Schema
+from pipeline.archive.schema import DATABASE_ERRORS, THUMBNAILS, Database, Schema
 from pipeline.errors import InputError
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.results.thumbnail import WHOLE, Thumbnail, ThumbnailRow, cut
@@ -38,7 +38,7 @@ _OFF_MIDDLE = 0.25  # fraction of a thumbnail's width: a mark farther off its mi
 class ThumbnailDatabase(Database):
     """Open database of thumbnails beside a results database; closed at the end of the `with` block."""
 
-    schema = Schema(0x52455354, 2, (_FIRST,), "thumbnails")  # "REST"
+    schema = Schema(THUMBNAILS, 2, (_FIRST,), "thumbnails")
 
     def __init__(self, measurement: Path) -> None:
         """Open the thumbnails of a results database."""

@@ -25,6 +25,7 @@ from pipeline.archive.checked_results import (
 )
 from pipeline.archive.results_database import ResultsDatabase, check_mergeable
 from pipeline.archive.schema import MEASUREMENTS, open_database
+from pipeline.archive.thumbnails import ThumbnailDatabase
 from pipeline.archive.verdicts import NEXT_STEP, Verdict, scan_verdict
 from pipeline.provenance import content_hash, file_state, hash_text, parts_hash, result_key, shard_number
 from pipeline.report.data import ReportData, frames
@@ -150,7 +151,11 @@ def test_what_is_no_store_is_refused(path: Path, tmp_path: Path) -> None:
             ResultsDatabase(path)
     ResultsDatabase(tmp_path / "a.db").close()
     (tmp_path / "camera.toml").write_text("name = 1")
+    ThumbnailDatabase(tmp_path / "measurement.db").close()
+    with sqlite3.connect(tmp_path / "of-others.db") as db:
+        db.execute("create table a (b)")
     others = {"b.db": "there is no such results", "camera.toml": "is no results", "a.db": "joined into"}
+    others |= {"of-others.db": "is no results", "thumbnails.db": "holds thumbnails and is no results"}
     for name, words in others.items():
         with pytest.raises(InputError, match=words):
             check_mergeable(tmp_path / "a.db", [tmp_path / name])
