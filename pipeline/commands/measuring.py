@@ -284,7 +284,10 @@ def review(
 def cameras(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME]", help="Print this camera's file, to start from. After --scan: more scans."),
+        typer.Argument(
+            metavar="[NAME]",
+            help="Print this camera's file, to start from. After --scan: more scans; after --save: more projects.",
+        ),
     ] = None,
     scan: Annotated[
         list[Path] | None,
@@ -315,7 +318,9 @@ def cameras(
 ) -> int:
     """List film cameras, print one, name a scan's camera, or save adjusted ones."""
     if saved:
-        return _save_cameras([shared.read(one) for one in saved], out, as_json)
+        if scan or own or pitch_um:
+            raise InputError("--save goes without --scan, --project and --pitch: it identifies no camera.")
+        return _save_cameras([shared.read(one) for one in (*saved, *map(Path, names or ()))], out, as_json)
     if own is not None or scan is not None:
         project = None if own is None else shared.read(own)
         given = [*(scan or ()), *(Path(name) for name in names or ())] or (project.scans.values() if project else ())

@@ -165,6 +165,15 @@ def test_two_archives_are_joined_to_what_both_together_give(archives: Path, tmp_
         assert sigma == pytest.approx(np.hypot(joint[name].sigma, spread / np.sqrt(2)), rel=0.15), name
 
 
+def test_projects_after_the_first_one_are_joined_and_not_dropped(
+    archives: Path, tmp_path: Path, printed_line: Printed, refusal: Refusal
+) -> None:
+    first, second = (archives / name / "project.toml" for name in "ab")
+    output = printed_line("cameras", "--save", first, second, "--out", tmp_path)
+    assert "of 2 scanners in a, b" in output
+    assert "--save goes without --scan" in refusal("cameras", "--save", first, "--scan", second)
+
+
 @pytest.mark.parametrize(("sigmas", "tau"), [((0.02,) * 9 + (0.002,), 0.02), ((0.02, 0.001), 0.02), ((0.01,) * 4, 0.1)])
 def test_standard_deviations_of_several_archives_hold(sigmas: tuple[float, ...], tau: float) -> None:
     """Of archives that differ, as precise as one another and not."""
