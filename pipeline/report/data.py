@@ -3,7 +3,7 @@
 import math
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -98,6 +98,7 @@ class ReportData:
     made_from : fingerprints of the files by name.
     given_by : source of the given fiducial coordinates by camera.
     stored_adjustment : of adjustment.json, where it is not shown: whether it is of the marks and settings.
+    part_of : frame by image, of images that show a part of it.
     totals : of all frames if these are many; comparator and measurement then hold only the frames shown.
     """
 
@@ -116,7 +117,12 @@ class ReportData:
     unit: str = "m"
     given_by: Mapping[str, str] = field(default_factory=dict)
     stored_adjustment: Literal["none", "current", "stale"] = "none"
+    part_of: Mapping[str, str] = field(default_factory=dict)
     totals: FrameTotals | None = None
+
+    def frame_count(self, images: Iterable[str]) -> int:
+        """Number of frames that images show, whole or in parts."""
+        return len({self.part_of.get(image) or image for image in images})
 
     @property
     def is_film_alone(self) -> bool:
@@ -263,8 +269,7 @@ def _marks(data: ReportData, scans: Mapping[str, MeasuredScan]) -> Iterator[Mark
     }
     given = {(row.image, row.kind == "fiducial", row.point): row for row in data.comparator}
     joined: dict[tuple[str, bool, str], MarkMeasurement | ComparatorPoint] = {**measured, **given}
-    frame_of = {image: each.part_of for image, each in data.adjustment.images.items()} if data.adjustment else {}
-    shown = {(frame_of.get(image), *name) for (image, *name), mark in joined.items() if mark.status.is_observation}
+    shown = {(data.part_of.get(image), *name) for (image, *name), mark in joined.items() if mark.status.is_observation}
     for key, known in joined.items():
         pixel, row, residual = measured.get(key), given.get(key), residuals.get(key)
         # Standard deviation used in the adjustment, film included; without an adjustment as measured.
@@ -272,8 +277,8 @@ def _marks(data: ReportData, scans: Mapping[str, MeasuredScan]) -> Iterator[Mark
         if residual is None and row and row.sigma_mm is not None:
             sigma_um = 1e3 * row.sigma_mm
         reason = pixel.reason if pixel and pixel.reason == known.reason else Reason.read(known.reason, "")
-        is_clear = bool(reason.codes) or known.status.is_observation or not frame_of.get(key[0])
-        if not is_clear and (frame_of[key[0]], *key[1:]) in shown:
+        is_clear = bool(reason.codes) or known.status.is_observation or not data.part_of.get(key[0])
+        if not is_clear and (data.part_of[key[0]], *key[1:]) in shown:
             reason = Reason(reason, Code.OTHER_PART)  # a comparator file has no codes
         yield Mark(
             image=key[0],

@@ -202,6 +202,7 @@ def measured_data(
         pitch_um=pitch_um,
         frame_mm={camera.name: camera.frame_mm for camera in project.cameras.values() if camera.frame_mm is not None},
         unit=project.unit,
+        part_of=project.given_images.part_of if project.given_images else {},
         given_by={camera.name: _coordinates_source(camera) for camera in project.cameras.values()},
         notes=tuple(filter(None, [outside_note(project), describe_decisions(read_decision_counts(comparator))])),
         made_from={project.comparator.name: hash_file(comparator)},

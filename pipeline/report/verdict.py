@@ -408,8 +408,8 @@ def _weight_notes(adjustment: AdjustmentRecord) -> Iterator[str]:
 
 
 def _sentence(data: ReportData, shots: list[ReportedFrame], level: Level, problems: int) -> str:
-    marks = _observed_count(data, shots)
-    found = f"{counted(marks, 'mark')} in {counted(len(data.totals.marks if data.totals else shots), 'frame')}"
+    marks, images = _observed_count(data, shots), data.totals.marks if data.totals else [shot.image for shot in shots]
+    found = f"{counted(marks, 'mark')} in {counted(data.frame_count(images), 'frame')}"
     ending = f", but {counted(problems, 'thing needs', 'things need')} a look." if level == "look" else "."
     if not marks:
         return "No mark was measured."
@@ -428,8 +428,8 @@ def _sentence(data: ReportData, shots: list[ReportedFrame], level: Level, proble
     if not constants:
         return f"Film transformations from {found}; no frame is oriented, and no camera calibrated{ending}"
     if not data.totals:
-        used = {row.image for row in data.adjustment.residuals}
-        found = f"{counted(len(data.adjustment.residuals), 'mark')} in {counted(len(used), 'frame')}"
+        used = data.frame_count(row.image for row in data.adjustment.residuals)
+        found = f"{counted(len(data.adjustment.residuals), 'mark')} in {counted(used, 'frame')}"
     return f"Calibrated from {found}: {'; '.join(constants)}{ending}"
 
 

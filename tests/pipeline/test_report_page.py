@@ -2,13 +2,13 @@
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any, get_args
-from unittest.mock import Mock
 
 import made_up_calibration
 import numpy as np
@@ -23,7 +23,7 @@ from adjust.solution.explanations import Explanation
 from measure import Code, MarkMeasurement, Reason, ScanOrientation, Status
 from measure.results import FrameMeasurement
 from pipeline.report import ReportData, ReportedProblem, judge, render_report, write_report
-from pipeline.report.data import ReportSection, frames
+from pipeline.report.data import FrameTotals, ReportSection, frames
 from pipeline.report.frame_problems import fraction_test, places_px
 from pipeline.report.parameters import spoken_name
 from pipeline.report.verdict import critical_w, problems_by_test, sigma0_bounds
@@ -596,12 +596,21 @@ def test_locked_positions_need_attention_and_recurring_ones_do_not(measured_data
 @pytest.mark.parametrize(("frame", "is_missing"), [("f", False), (None, True)])
 def test_fiducials_that_another_scan_of_the_frame_shows_are_not_missing(frame: str | None, is_missing: bool) -> None:
     """In a comparator file without measurement, as `reseau block` writes it: it has no codes."""
-    adjustment = Mock(residuals=(), images={name: Mock(part_of=frame) for name in "lr"})
+    part_of = {"l": frame, "r": frame} if frame else {}
     shown = ComparatorPoint("l", "1", "fiducial", np.zeros(2), np.full(2, 0.005), 0.0, Status.MEASURED, "")
     absent = ComparatorPoint("r", "1", "fiducial", None, None, 0.0, Status.ABSENT, "it lies in l")
-    left, right = frames(ReportData("Halves", [shown, absent], adjustment=adjustment))
+    left, right = frames(ReportData("Halves", [shown, absent], part_of=part_of))
     assert not left.marks[0].codes
     assert right.marks[0].needs_review is is_missing
+
+
+@pytest.mark.parametrize("is_many", [False, True])
+def test_the_parts_of_a_frame_count_as_one_frame(is_many: bool) -> None:
+    marks = [ComparatorPoint(i, "1", "fiducial", np.zeros(2), np.ones(2), 0.0, Status.MEASURED, "") for i in "lrw"]
+    data = ReportData("Halves", marks, part_of={"l": "f", "r": "f", "w": ""})
+    counts = {image: Counter[str]({Status.MEASURED: 1}) for image in "lrw"}
+    totals = FrameTotals(counts, {}, {}, (), {"col": np.zeros(0), "row": np.zeros(0)}) if is_many else None
+    assert judge(replace(data, totals=totals)).sentence.startswith("Measured: 3 marks in 2 frames")
 
 
 def test_quantities_are_called_as_in_the_tables() -> None:
