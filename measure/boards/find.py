@@ -11,10 +11,11 @@ from scipy.special import comb
 
 from measure.array_types import Array, Bytes, Integers
 from measure.boards.lattice import find_squares
-from measure.boards.markers import are_diagonal, find_aruco, find_charuco, read_any_markers
+from measure.boards.markers import are_diagonal, find_aruco, find_charuco, read_any_markers, read_board
 from measure.boards.specs import (
     AprilGridSpec,
     ArucoSpec,
+    BoardSpec,
     CharucoSpec,
     ChessboardSpec,
     FoundBoard,
@@ -296,9 +297,9 @@ def _refusal(spec: ChessboardSpec, pattern: WholePattern | None) -> str:
         )
     message += f"; one of {columns} x {rows} is"
     if pattern.is_bounded and (columns, rows) == (spec.columns - 1, spec.rows - 1):
-        return f"{message}: squares may have been counted in place of inner corners, which columns and rows count"
+        return f"{message}: squares may have been counted in place of inner corners"
     if columns > spec.columns or rows > spec.rows or pattern.is_bounded:
-        return f"{message}. Set columns and rows to the count of the board's inner corners"
+        return f"{message}. Correct the count of the board's inner corners"
     return (
         f"{message}, and the rest may lie outside of the scan or be covered; nothing shows which part it is. Show the "
         "board's light border on two adjacent sides, and more of its longer side than the shorter one has"
@@ -424,11 +425,18 @@ def _find_markers(picture: Bytes, spec: ArucoSpec | CharucoSpec) -> FoundBoard:
     return mirrored.mirror(picture.shape[1]) if is_mirrored else upright
 
 
+def fitting_board(scan: Scan, spec: BoardSpec) -> ArucoSpec | CharucoSpec | None:
+    """Return the variant of a board of markers, or the board itself, with which most markers of a scan agree."""
+    picture, reason = _searchable(scan, _first_factor(scan))
+    if isinstance(spec, ArucoSpec):
+        return None if reason else read_board(picture, spec)[1]
+    return read_board(picture, spec)[1] if isinstance(spec, CharucoSpec) and not reason else None
+
+
 def recognise_board(scan: Scan) -> str:
     """Options of `reseau calibrate` for the board that a scan shows: "--board 9x6" for a chessboard, kind and
     dictionary for markers; "" if no board is found."""
-    factor = max(round(max(scan.width_px, scan.height_px) / _FIRST_SIZE_PX), 1)
-    picture, reason = _searchable(scan, factor)
+    picture, reason = _searchable(scan, _first_factor(scan))
     if reason:
         return ""
     dictionary, border, markers = read_any_markers(picture)
@@ -443,6 +451,11 @@ def recognise_board(scan: Scan) -> str:
         return ""
     rows, columns = sorted(pattern.grid.shape[:2])
     return f"--board {columns}x{rows}"
+
+
+def _first_factor(scan: Scan) -> int:
+    """Factor that reduces a scan for a first look."""
+    return max(round(max(scan.width_px, scan.height_px) / _FIRST_SIZE_PX), 1)
 
 
 def _searchable(scan: Scan, factor: int) -> tuple[Bytes, Reason]:

@@ -219,7 +219,7 @@ def find_grid(points_px: Array, appearances: Array, spec: CircleGridSpec | Squar
             off = [abs(columns - spec.columns) + abs(rows - spec.rows) for columns, rows in counts]
             columns, rows = counts[int(np.argmin(off))]
             other = grid_size(replace(spec, columns=columns, rows=rows), what)
-            message = f"no grid of {size} is whole in the scan; one of {other} is. Set columns and rows to its count"
+            message = f"no grid of {size} is whole in the scan; one of {other} is. Correct the count"
             if not is_larger:
                 message += ", or show the whole grid, with all of its lines"
         elif assignments:

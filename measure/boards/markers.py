@@ -228,7 +228,7 @@ def _side_px(image_px: Array) -> float:
 
 def find_aruco(picture: Bytes, spec: ArucoSpec) -> FoundBoard:
     """Find the corners of a board's ArUco markers. A corner's steps are the sides of the marker that leave it."""
-    read, layout = _read_board(picture, spec)
+    read, layout = read_board(picture, spec)
     if layout != spec:
         return _other_layout_board(spec, layout)
     found: dict[str, FoundCorner] = {}
@@ -240,7 +240,7 @@ def find_aruco(picture: Bytes, spec: ArucoSpec) -> FoundBoard:
 def find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
     """Find the inner corners of a ChArUco board whose adjacent markers are read. If the specification does not state
     which of OpenCV's two layouts the board has, the markers decide."""
-    read, layout = _read_board(picture, spec)
+    read, layout = read_board(picture, spec)
     if layout not in (spec, replace(spec, legacy=True) if spec.legacy is None else spec):
         return _other_layout_board(spec, layout)
     spec = layout
@@ -268,7 +268,7 @@ def find_charuco(picture: Bytes, spec: CharucoSpec) -> FoundBoard:
     return FoundBoard(kept, refused=read.refused, off_corners=off)
 
 
-def _read_board(picture: Bytes, spec: Layout) -> tuple[ReadMarkers, Layout]:
+def read_board(picture: Bytes, spec: Layout) -> tuple[ReadMarkers, Layout]:
     """Read a board's markers. Returns them with the layout, the specified one or a variant, with which most of them
     agree."""
     touched = isinstance(spec, AprilGridSpec)

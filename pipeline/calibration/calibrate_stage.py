@@ -20,7 +20,7 @@ from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
 from adjust.validation import LARGEST_SIGMA
 from measure import MeasurementError, open_scan
-from measure.boards.find import recognise_board
+from measure.boards.find import fitting_board, recognise_board
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
 from pipeline.calibration import project_files
 from pipeline.calibration.intrinsics import (
@@ -207,7 +207,7 @@ def _calibrate_cameras(
             except (AdjustmentError, InputError) as error:
                 not_calibrated[camera.name] = str(error)
     if not adjustments:
-        raise InputError(_nothing(pictures, left_out, not_calibrated))
+        raise InputError(_nothing(pictures, left_out, not_calibrated, options.board))
     written.pictures, names = written.pictures.select(adjustments)
     project = written.write()
     if any(name != earlier for earlier, name in names.items()):  # the cameras left out had folders of their own
@@ -285,15 +285,23 @@ def _chosen_lens(
     return choose_lens(alike, options.square_pixels, options.pixel_mm, adjusted, first.start)
 
 
-def _nothing(pictures: BoardPictureFiles, left_out: Mapping[str, str], not_calibrated: Mapping[str, str]) -> str:
+def _nothing(
+    pictures: BoardPictureFiles,
+    left_out: Mapping[str, str],
+    not_calibrated: Mapping[str, str],
+    board: project_files.BoardOptions,
+) -> str:
     """Reason why no camera is calibrated."""
     number = sum(len(camera.images) for camera in pictures.cameras)
     if len(left_out) == number:
         first, shown = pictures.cameras[0].images[0], ""
+        found = f"the board was found in none of {counted(number, 'picture')}"
         with suppress(MeasurementError), open_scan(pictures.files[first]) as scan:
+            if options := board.differing_options(fitting_board(scan, board.spec)):
+                return f"{found}: the markers of {first} lie as with {options}. Give that if it is the board's."
             shown = recognise_board(scan)
         return (
-            f"the board was found in none of {counted(number, 'picture')}; of most: {_most_common(left_out.values())}. "
+            f"{found}; of most: {_most_common(left_out.values())}. "
             "Check --board (inner corners of a chessboard, not squares), --kind, --dictionary, --first-id, and that "
             f"the board is in the picture{shown and f': what {first} shows fits {shown}'}."
         )

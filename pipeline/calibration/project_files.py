@@ -12,6 +12,7 @@ from typing import Literal, cast, get_args
 import numpy as np
 
 from adjust.functional_model.opencv_family import FISHEYE_NAMES, OPENCV_NAMES
+from measure.boards.specs import AprilGridSpec, ArucoSpec, BoardSpec, CharucoSpec
 from pipeline.calibration.intrinsics import CameraIntrinsics, LensModel, LensSetting, free_lens
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures
 from pipeline.errors import InputError
@@ -81,6 +82,25 @@ class BoardOptions:
         return "\n".join(["[targets]", *table_lines(keys), ""])
 
     @property
+    def spec(self) -> BoardSpec:
+        """The board. Raises ValueError where there is none."""
+        return cast(BoardTable, TARGET_TABLES[self.kind](**tomllib.loads(self.table)["targets"])).board
+
+    def differing_options(self, other: ArucoSpec | CharucoSpec | None) -> str:
+        """Options of another board of markers, as far as they differ from these; "" for the same board, or none."""
+        if other is None:
+            return ""
+        first_id = other.first_id if isinstance(other, CharucoSpec) else other.first_marker
+        kinds = {CharucoSpec: "charuco", AprilGridSpec: "aprilgrid", ArucoSpec: "aruco"}
+        options = {
+            f"--kind {kinds[type(other)]}": kinds[type(other)] != self.kind,
+            f"--board {other.columns}x{other.rows}": (other.columns, other.rows) != (self.columns, self.rows),
+            f"--first-id {first_id}": first_id != self.first_id,
+            "without --legacy": self.legacy and not getattr(other, "legacy", True),
+        }
+        return " ".join(option for option, differs in options.items() if differs)
+
+    @property
     def _size(self) -> float:
         if self.size_mm is None:
             what = "the diameter of a circle" if "circle" in self.kind else "the side of a marker"
@@ -129,9 +149,8 @@ def board_options(
     columns, rows = map(int, counts.groups())
     spacing_mm = _length_mm("--square", square)
     found = BoardOptions(kinds[kind], columns, rows, spacing_mm, size_mm, dictionary, legacy, first_id)
-    table = TARGET_TABLES[kind](**tomllib.loads(found.table)["targets"])
     try:
-        _ = cast(BoardTable, table).board
+        _ = found.spec
     except ValueError as error:
         raise InputError(f"--kind {kind} --board {board}: {error}.") from None
     return found

@@ -143,10 +143,10 @@ def test_an_asymmetric_grid_in_a_mirror_keeps_its_names(is_mirrored: bool) -> No
 @parametrize_with_studies(
     ("columns", "rows", "words"),
     [
-        (5, 5, "one of 6 x 5 is. Set columns and rows"),
-        (6, 4, "one of 6 x 5 is. Set columns and rows"),
-        (4, 3, "one of 6 x 5 is. Set columns and rows"),
-        (7, 5, "one of 6 x 5 is. Set columns and rows"),
+        (5, 5, "one of 6 x 5 is. Correct the count"),
+        (6, 4, "one of 6 x 5 is. Correct the count"),
+        (4, 3, "one of 6 x 5 is. Correct the count"),
+        (7, 5, "one of 6 x 5 is. Correct the count"),
         (7, 6, "one of 6 x 5 is: squares may have been counted"),
     ],
     quick=(2,),
@@ -385,7 +385,7 @@ def test_a_board_of_less_than_half_the_size_is_another_one() -> None:
 def test_a_circle_grid_is_no_part_of_a_larger_one() -> None:
     larger = specs.CircleGridSpec(7, 5, 28.0, 13.0)
     board = measure_board(draw.make_scan(draw.tile_boards(larger, draw.circles_dark(larger), (1.0,))), SMALL_DOTS)
-    assert "no grid of 6 x 5 dots is whole in the scan; one of 7 x 5 dots is. Set columns and rows" in board.reason
+    assert "no grid of 6 x 5 dots is whole in the scan; one of 7 x 5 dots is. Correct the count" in board.reason
     assert {mark.status for mark in board.marks} == {Status.ABSENT}
 
 
@@ -395,7 +395,7 @@ def test_an_asymmetric_grid_of_another_count_is_refused_with_its_own(columns: in
     grid = specs.CircleGridSpec(8, 11, 14.0, 9.0, asymmetric=True)
     picture = draw.take_picture(grid, draw.board_from_pixel(4.0, 2e-4), draw.circles_dark(grid))
     board = measure_board(draw.make_scan(picture), replace(grid, columns=columns, rows=rows))
-    assert "one of 44 dots in 11 rows of 4 is. Set columns and rows to its count" in board.reason
+    assert "one of 44 dots in 11 rows of 4 is. Correct the count" in board.reason
     assert ("or show the whole grid" in board.reason) == (columns * rows > 88)
     assert {mark.status for mark in board.marks} == {Status.ABSENT}
 

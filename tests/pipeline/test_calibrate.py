@@ -50,6 +50,7 @@ from pipeline.text.toml_tables import Table
 Array = NDArray[np.float64]
 
 BOARD = ChessboardSpec(7, 5, 20.0)
+CHESSBOARD = board_options("chessboard", "7x5", "20mm")
 SIZE_PX, FOCAL_PX, CENTER_PX = (400, 320), 520.0, (203.0, 157.0)
 PITCH_MM = 0.01
 MATRIX = np.array([[FOCAL_PX, 0.0, CENTER_PX[0]], [0.0, FOCAL_PX, CENTER_PX[1]], [0.0, 0.0, 1.0]])
@@ -440,14 +441,41 @@ def test_a_picture_of_another_print_is_named_and_no_other(odd: tuple[str, ...], 
 def test_where_no_board_is_found_the_message_names_what_the_first_picture_shows(folder: Path, tmp_path: Path) -> None:
     pictures = find_pictures([folder], tmp_path)
     images = [name for camera in pictures.cameras for name in camera.images]
-    message = calibrate_stage._nothing(pictures, dict.fromkeys(images, "no marker was read"), {})
+    message = calibrate_stage._nothing(pictures, dict.fromkeys(images, "no marker was read"), {}, CHESSBOARD)
     assert message.endswith("that the board is in the picture: what p0 shows fits --board 7x5.")
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "wanted"),
+    [
+        ("charuco", ("5x6", 0), "--board 6x5 --first-id 9"),
+        ("aruco", ("3x4", 0), "--board 4x3 --first-id 5"),
+        ("aprilgrid", ("4x3", 5), "--kind aruco"),
+    ],
+)
+def test_the_options_of_the_board_in_the_picture_are_named(
+    kind: str, given: tuple[str, int], wanted: str, tmp_path: Path
+) -> None:
+    """By OpenCV's own drawings; the keys of the project file, which measure names, are not the user's."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    grid = cv2.aruco.GridBoard((4, 3), 20.0, 8.0, dictionary, np.arange(5, 17))
+    charuco = cv2.aruco.CharucoBoard((6, 5), 28.0, 20.0, dictionary, np.arange(9, 24))
+    drawing = (charuco if kind == "charuco" else grid).generateImage((560, 420), marginSize=20)
+    Image.fromarray(cv2.GaussianBlur(drawing, (0, 0), 0.7)).save(tmp_path / "p0.png")
+    counts, first_id = given
+    options = board_options(kind, counts, "28mm", "20mm", "APRILTAG_36h11", first_id=first_id)
+    pictures, reason = find_pictures([tmp_path], tmp_path / "o"), "as with columns = 6, first_marker = 5"
+    message = calibrate_stage._nothing(pictures, {"p0": reason}, {}, options)
+    place = "the board was found in none of 1 picture: the markers of p0 lie as with"
+    assert message == f"{place} {wanted}. Give that if it is the board's."
 
 
 def test_pictures_that_were_all_cut_are_refused_in_one_sentence() -> None:
     cameras = tuple(CameraPictures(f"camera-{k}", 640 + k, 480, None, (f"p{k}",)) for k in range(3))
     pictures = BoardPictureFiles({f"p{k}": Path(f"p{k}.png") for k in range(3)}, cameras, {})
-    message = calibrate_stage._nothing(pictures, {}, {camera.name: "the board is in 1 picture" for camera in cameras})
+    message = calibrate_stage._nothing(
+        pictures, {}, {each.name: "the board is in 1 picture" for each in cameras}, CHESSBOARD
+    )
     assert message.startswith("the 3 pictures have 3 sizes or focal lengths (640 x 480 px, 641 x 480 px, 642 x 480 px)")
     assert "cut or reduced" in message
     assert "in 1 picture" not in message
