@@ -242,7 +242,7 @@ def import_micmac(paths: Sequence[Path], options: incoming.ImportOptions) -> inc
         for image in images:
             name = image_name(incoming.child_text(image, "NameIm", path))
             for point, place, sigma_px in _points(image, path):
-                covariance = sigma_px**2 * np.eye(2) if sigma_px is not None and sigma_px > 0.0 else None
+                covariance = sigma_px**2 * np.eye(2) if sigma_px is not None else None
                 marks.append(incoming.ForeignMark(name, point, kind, place - MICMAC.first_pixel_px, covariance))
     return incoming.Incoming(tuple(marks), tuple(cameras))
 
@@ -250,14 +250,15 @@ def import_micmac(paths: Sequence[Path], options: incoming.ImportOptions) -> inc
 def _points(image: incoming.Element, path: Path) -> Iterator[tuple[str, Array, float | None]]:
     """Name, place and standard deviation (or None) of an image's marks."""
     for mark in image.findall("OneMesureAF1I"):
-        sigma_px = (
-            incoming.child_numbers(mark, "PrecPointe", 1, path)[0] if mark.find("PrecPointe") is not None else None
-        )
-        yield (
-            incoming.child_text(mark, "NamePt", path),
-            np.array(incoming.child_numbers(mark, "PtIm", 2, path)),
-            sigma_px,
-        )
+        name, place = incoming.child_text(mark, "NamePt", path), incoming.child_numbers(mark, "PtIm", 2, path)
+        is_given = mark.find("PrecPointe") is not None
+        sigma_px = incoming.child_numbers(mark, "PrecPointe", 1, path)[0] if is_given else -1.0
+        if not (sigma_px > 0.0 or sigma_px == -1.0):
+            raise InputError(
+                f"{path}: <PrecPointe> of mark {name!r} is {sigma_px:g}; a positive standard deviation in px is right. "
+                "Correct it; -1 leaves it to --sigma-px."
+            )
+        yield name, np.array(place), sigma_px if sigma_px > 0.0 else None
 
 
 MMVII = Convention(

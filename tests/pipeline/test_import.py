@@ -124,6 +124,7 @@ def test_cameras_of_rectified_frames_come_back_together(format: str, project: Pa
 METASHAPE = "<calibration><width>9</width><height>9</height><f>3</f>{}</calibration>"
 MARK = "<OneMesureAF1I><NamePt>1</NamePt><PtIm>{}</PtIm></OneMesureAF1I>"
 MARKS = f"<MesureAppuiFlottant1Im><NameIm>a</NameIm>{MARK}</MesureAppuiFlottant1Im>"
+PRECISION = MARKS.format("1 2").replace("</PtIm>", "</PtIm><PrecPointe>{}</PrecPointe>")
 MESIM = (
     "<Root><Data><SetMesIm><NameIm>a.tif</NameIm><Measures><el><Name>p</Name><Pt>1 2</Pt><Sigma2>{}</Sigma2></el>"
     "</Measures></SetMesIm></Data></Root>"
@@ -149,6 +150,7 @@ ENTITIES = '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]><a>&c
         ("micmac", "<a/>", "has no <MesureAppuiFlottant1Im>"),
         ("micmac", MARKS.format("1 x"), "should be 2 numbers"),
         ("micmac", MARKS.format("1 nan"), "should be 2 numbers"),
+        *(("micmac", PRECISION.format(s), f"<PrecPointe> of mark '1' is {s}; a positive") for s in ("0", "-2")),
         *(
             ("mmvii", MESIM.format(s), f"<Sigma2> of mark 'p' is {s}; a covariance")
             for s in ("0 0 0", "1 5 1", "-4 0 -1")
