@@ -124,28 +124,7 @@ def adjust_unmodelled(network: Network, options: Options | None = None, pixel_mm
     options = options or Options()
     plausible_mm = {each.name: PLAUSIBLE * float(np.hypot(*each.frame_mm)) for each in network.cameras}
     refitted = partial(_fit_unmodelled, options=options)
-
-    def drop_contradicting(given: Network, first: Adjustment) -> Adjustment:
-        doubtful = [
-            name
-            for name, limit_mm in plausible_mm.items()
-            if limit_mm and (first.unmodelled_mm[name] > limit_mm or _is_of_some_frames(first, name))
-        ]
-
-        def agrees(result: Adjustment) -> bool:
-            return result.converged and all(
-                result.unmodelled_mm[name] <= plausible_mm[name]
-                and CLEARER * _marks_sigma_mm(result, name) <= _marks_sigma_mm(first, name)
-                for name in doubtful
-            )
-
-        if not doubtful:
-            return first
-        found = _leave_out_contradicting(given, first, refitted, agrees, several=True)
-        rest = _leave_out(given, found.left_out.keys() - first.left_out.keys()) if found is not first else None
-        return found if rest is None else drop_contradicting(rest, found)  # less gross ones show only then
-
-    result = drop_contradicting(network, refitted(network))
+    result = _drop_contradicting(network, refitted(network), refitted, plausible_mm)
     per_mm, unit = (1000.0, "µm") if pixel_mm is None else (1.0 / pixel_mm, "px")
     warnings = (
         f"Camera {name}: errors of {per_mm * sigma_mm:.3g} {unit} are not modelled, one part in "
@@ -155,6 +134,33 @@ def adjust_unmodelled(network: Network, options: Options | None = None, pixel_mm
         if sigma_mm > plausible_mm[name] > 0.0
     )
     return replace(result, remarks=(*result.remarks, *warnings))
+
+
+def _drop_contradicting(
+    network: Network,
+    first: Adjustment,
+    refitted: Callable[[Network], Adjustment],
+    plausible_mm: Mapping[str, float],
+) -> Adjustment:
+    """Leave out the frames without which unmodelled errors are CLEARER times smaller, and then less gross ones."""
+    doubtful = [
+        name
+        for name, limit_mm in plausible_mm.items()
+        if limit_mm and (first.unmodelled_mm[name] > limit_mm or _is_of_some_frames(first, name))
+    ]
+    if not doubtful:
+        return first
+
+    def agrees(result: Adjustment) -> bool:
+        return result.converged and all(
+            result.unmodelled_mm[name] <= plausible_mm[name]
+            and CLEARER * _marks_sigma_mm(result, name) <= _marks_sigma_mm(first, name)
+            for name in doubtful
+        )
+
+    found = _leave_out_contradicting(network, first, refitted, agrees, several=True)
+    rest = _leave_out(network, found.left_out.keys() - first.left_out.keys()) if found is not first else None
+    return found if rest is None else _drop_contradicting(rest, found, refitted, plausible_mm)
 
 
 def _fit_unmodelled(network: Network, options: Options) -> Adjustment:

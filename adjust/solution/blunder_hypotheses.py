@@ -277,7 +277,7 @@ def exchanged_cameras(network: Network, given: Adjustment, trials: Trials) -> st
 
 
 def _hold_principal_distances(network: Network) -> Network:
-    """Fix principal distances at 1.5 times the extent of the images: any value shows whether they are determinable."""
+    """Fix principal distances, at 1.5 times the extent of the images: where these leave them open, any value fits."""
     held = Prior(1.5 * float(np.ptp(network.observations.xy_mm)), 0.0)
     return replace(network, cameras=tuple(replace(each, principal_distance_mm=held) for each in network.cameras))
 

@@ -27,6 +27,7 @@ from measure.geometry import (
 )
 from measure.marks.shapes import LayoutMark, Mark, places_mm
 
+FREE_MARKS = 2  # marks that a similarity fits wherever they lie
 NARROW = 0.25  # fraction of the tolerance within which marks agree on film that is hardly deformed
 _LEAST_WEIGHED = 0.1  # response above which a mark has weight in the refinement of a placement
 _PAIRS = 60  # pairs of marks from which hypotheses are made

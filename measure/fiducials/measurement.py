@@ -13,7 +13,7 @@ from measure.annotations.lines import KnownLine, Line
 from measure.annotations.text import networks, read_writing
 from measure.array_types import Array
 from measure.fiducials.clicked_frame import clicked_frame
-from measure.fiducials.constellation import Placement
+from measure.fiducials.constellation import FREE_MARKS, Placement
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA
 from measure.fiducials.mark_fit import Detection
 from measure.fiducials.measure_frame import Frame, detect_some, measure_frame, orient_frame, rename_frame
@@ -47,7 +47,6 @@ _OBLIQUE = Reason(
 )
 _FRAME_SHIFT = 0.95  # fraction of the frame's size: a rival shifted by more is another photograph
 _AMBIGUOUS = 0.9  # fraction of the best score from which another placement is a rival
-_FREE = 2  # marks that a similarity fits wherever they lie
 _FEWER_FOUND = 0.5  # times the fraction of all marks found
 _PLAIN_PX = 3.0  # px across the finest line of a mark: both edges and the inside are resolved
 _ASSUMED = Reason(
@@ -214,10 +213,8 @@ def _rivals(result: SearchResult, frame: Frame) -> list[Reason]:
         # perspective of a film photographed obliquely, if they are nearest to it under the names they have.
         if fits and np.hypot(*(other.places_px(found_mm) - found_px).T).max() <= frame.first_search_px:
             continue
-        if fits and frame.options.is_oblique:
-            nearest = cKDTree(other.places_px(frame.camera_mm)).query(found_px)[1]
-            if (nearest == list(fits)).all():
-                continue
+        if fits and frame.options.is_oblique and other.names(found_px, frame.camera_mm).tolist() == list(fits):
+            continue
         as_good = other.score >= _AMBIGUOUS * best.score and (
             other.supported >= best.supported - 1 or _lacks_its_own(frame, other)
         )
@@ -252,10 +249,10 @@ def _lacks_its_own(frame: Frame, rival: Placement) -> bool:
 
 def _outdoes(frame: Frame, rival: Placement) -> bool:
     """Whether a frame has all marks that are found from a rival placement, and two or more besides."""
-    if rival.supported > len(frame.unblemished) - _FREE:
+    if rival.supported > len(frame.unblemished) - FREE_MARKS:
         return False
     frame_there = measure_frame(frame.scan, frame.layout, rival, frame.options)
-    return frame.contains(frame_there) and len(frame_there.unblemished) <= len(frame.unblemished) - _FREE
+    return frame.contains(frame_there) and len(frame_there.unblemished) <= len(frame.unblemished) - FREE_MARKS
 
 
 def _is_another_frame(result: SearchResult, other: Placement, frame: Frame) -> bool:

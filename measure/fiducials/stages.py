@@ -20,7 +20,7 @@ import numpy as np
 from measure.array_types import Array
 from measure.detection.correlation import CLOSE, GRAINY, WIDE, Surroundings
 from measure.detection.significance import chance_of_marks, share_of_places
-from measure.fiducials.constellation import NARROW, Placement, distinct_places
+from measure.fiducials.constellation import FREE_MARKS, NARROW, Placement, distinct_places
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA
 from measure.fiducials.measure_frame import (
     CHECKED,
@@ -77,7 +77,6 @@ _STRETCHES = np.linspace(-0.03, 0.03, 13)  # relative, of non-square pixels; a s
 _RARE_FRAMES, _FREQUENT_FRAMES = 1e-3, 1e6
 _MOST_COUNTED = 3  # marks at most to whose false-alarm rates the share at full resolution applies
 _APART = 2.0  # in search radii: beyond the response of a mark itself
-_FREE = 2  # marks that a similarity fits wherever they lie
 _SURE = 12  # inliers from which the frame is no false alarm: specks do not agree so often
 
 
@@ -482,7 +481,7 @@ def doubt_frame(result: SearchResult, frame: Frame) -> Reason:
     if len(clear) < inside:
         matches, places = random_matches(frame, clear)
         hits = max(matches.values(), default=places)
-        p_value = float(chance_of_marks(len(clear) - _FREE, inside - _FREE, share_of_places(hits, places)))
+        p_value = float(chance_of_marks(len(clear) - FREE_MARKS, inside - FREE_MARKS, share_of_places(hits, places)))
         if p_value <= FRAME_DOUBT_P:
             return NO_REASON
         unmatched = sum(each == 0 for each in matches.values())
@@ -495,7 +494,7 @@ def doubt_frame(result: SearchResult, frame: Frame) -> Reason:
                 else (Code.CHANCE,)
             ),
         )
-    if len(clear) <= _FREE or not result.is_exhaustive(frame.placement):
+    if len(clear) <= FREE_MARKS or not result.is_exhaustive(frame.placement):
         return NO_REASON
     expected = false_frames(result, frame, clear)
     if expected <= FRAME_DOUBT_P:

@@ -362,7 +362,7 @@ def calibrate(
 
     Returns
     -------
-    Calibration
+    CalibrationResult
         Its cameras in px with standard deviations, `adjustments` by camera, plots and a table.
 
     Raises

@@ -109,10 +109,10 @@ def _check_fiducials_by_joins(scans: Sequence[MeasuredScan]) -> list[MeasuredSca
             few = Reason("so few fiducials fit many frames, and no other part of this one checks them", Code.NO_CHECK)
             result[image] = scan.change_status("fiducial", Status.WEAK, few)
     shown = {point: image for image, scan in reversed(result.items()) for point in _fiducials(scan)}
-    return [_excuse_fiducials(scan, shown) for scan in result.values()]
+    return [_explain_missing_fiducials(scan, shown) for scan in result.values()]
 
 
-def _excuse_fiducials(scan: MeasuredScan, shown: Mapping[str, str]) -> MeasuredScan:
+def _explain_missing_fiducials(scan: MeasuredScan, shown: Mapping[str, str]) -> MeasuredScan:
     """Scan in which fiducials are not missing that lie outside of it and in another one of its frame; nor is any where
     a joined scan shows none of them, as the middle one of three. shown: the other scan, by fiducial."""
     marks = scan.frame.marks

@@ -277,8 +277,8 @@ def _marks(data: ReportData, scans: Mapping[str, MeasuredScan]) -> Iterator[Mark
         if residual is None and row and row.sigma_mm is not None:
             sigma_um = 1e3 * row.sigma_mm
         reason = pixel.reason if pixel and pixel.reason == known.reason else Reason.read(known.reason, "")
-        is_clear = bool(reason.codes) or known.status.is_observation or not data.part_of.get(key[0])
-        if not is_clear and (data.part_of[key[0]], *key[1:]) in shown:
+        frame, is_missing = data.part_of.get(key[0]), not known.status.is_observation
+        if frame and is_missing and not reason.codes and (frame, *key[1:]) in shown:
             reason = Reason(reason, Code.OTHER_PART)  # a comparator file has no codes
         yield Mark(
             image=key[0],
