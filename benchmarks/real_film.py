@@ -2,29 +2,36 @@
 
 Each scan is measured alone, with automatic pose, and checked as a camera of one frame. --keep writes all marks to a
 file; --against names such a file, and marks whose status differs or whose place differs by more than 0.005 px are
-listed, and problems that differ. --tone linear takes grey values as light.
+listed, and problems that differ. --tone linear takes grey values as light. --pictures names a folder for a picture per
+scan of all marks that are not `measured`, with the reason.
 """
 
 import json
+import textwrap
 import time
 import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from benchmarks.harness import DATA, Row
 from measure.fiducials.across_frames import check_frames
 from measure.fiducials.measurement import measure_fiducials
 from measure.fiducials.options import FiducialOptions
+from measure.flags import Status
 from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, cross
+from measure.results import FrameMeasurement
 from measure.scans.opening import open_scan
+from measure.scans.scan import Scan
 from measure.tone.curve import LINEAR, Tone
 from pipeline.files.camera_file import read_camera
 from pipeline.files.library import camera_path
 
 MOVED_PX = 0.005
+HALF_PX, SHOWN_PX, WORDS_PX, COLUMNS_SHOWN = 40, 320, 110, 4  # of the pictures of marks: half a window, enlarged
 CAMERAS = {
     "0b4cb981": "zeiss-rmk-a-153",
     "000b3b38": "wild-rc10-153",
@@ -76,15 +83,17 @@ def cells() -> Iterator[Row]:
     yield from ({"scan": task.name} for task in tasks(DATA))
 
 
-def case(scan: str, tone: str = "auto", against: str | None = None) -> Row:
+def case(scan: str, tone: str = "auto", against: str | None = None, pictures: str | None = None) -> Row:
     task = next(task for task in tasks(DATA) if task.name == scan)
     start_s = time.process_time()
     with open_scan(task.scan) as opened:
         pitch_um = task.pitch_um or opened.pitch_um
         shown = opened.replace_tone(LINEAR if tone == "linear" else Tone.unknown())
         frame = measure_fiducials(shown, task.layout, pitch_um, FiducialOptions())
-    frame = check_frames([frame], task.layout, [pitch_um or (1.0, 1.0)]).frames[0]
-    cpu_s = time.process_time() - start_s
+        frame = check_frames([frame], task.layout, [pitch_um or (1.0, 1.0)]).frames[0]
+        cpu_s = time.process_time() - start_s
+        if pictures:
+            picture_marks(opened, frame, Path(pictures) / f"{scan}.png")
     marks: dict[str, Row] = {
         mark.point: {
             "status": str(mark.status),
@@ -107,6 +116,28 @@ def case(scan: str, tone: str = "auto", against: str | None = None) -> Row:
         "problems": [str(problem) for problem in frame.problems],
     }
     return {**row, "changes": changes(_kept_row(Path(against), scan), row) if against else []}
+
+
+def picture_marks(scan: Scan, frame: FrameMeasurement, path: Path) -> None:
+    """Write an image of the marks that are not `measured`, each about its place, with its status and reason."""
+    tiles = []
+    for mark in frame.marks:
+        if mark.status is Status.MEASURED:
+            continue
+        tile = np.full((SHOWN_PX + WORDS_PX, SHOWN_PX), 255, np.uint8)
+        if mark.center_px is not None:
+            col0, row0 = (round(float(place)) - HALF_PX for place in mark.center_px)
+            grey = scan.samples(col0, row0, 2 * HALF_PX + 1, 2 * HALF_PX + 1)[..., 0].astype(np.float32)
+            shown = cv2.normalize(grey, np.empty(0), 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+            tile[:SHOWN_PX] = cv2.resize(shown, (SHOWN_PX, SHOWN_PX), interpolation=cv2.INTER_NEAREST)
+        for number, text in enumerate(textwrap.wrap(f"{mark.point} {mark.status}: {mark.reason}", 52)[:7]):
+            cv2.putText(tile, text, (2, SHOWN_PX + 14 * (number + 1)), cv2.FONT_HERSHEY_PLAIN, 0.72, 0, 1, cv2.LINE_AA)
+        tiles.append(tile)
+    if tiles:
+        tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % COLUMNS_SHOWN)
+        rows = [np.hstack(tiles[first : first + COLUMNS_SHOWN]) for first in range(0, len(tiles), COLUMNS_SHOWN)]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), np.vstack(rows))
 
 
 def _kept_row(kept: Path, scan: str) -> Row:

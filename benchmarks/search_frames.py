@@ -86,7 +86,7 @@ def draw_case(seed: int, index: int, pitch_um: float = PITCH_UM) -> SearchCase:
     """Frame number index of the study with that seed."""
     rng = np.random.default_rng([seed, index])
     kind, symmetry = str(rng.choice(KINDS)), str(rng.choice(SYMMETRIES))
-    return make_case(rng, kind, symmetry, _layout(rng, kind, symmetry), f"{index}.tif", pitch_um=pitch_um)
+    return make_case(rng, kind, symmetry, draw_layout(rng, kind, symmetry), f"{index}.tif", pitch_um=pitch_um)
 
 
 def make_case(
@@ -96,7 +96,7 @@ def make_case(
     layout: FiducialLayout,
     name: str,
     tones: Tones | None = None,
-    gamma: float = 1.0,
+    gamma: float | str = 1.0,
     pitch_um: float = PITCH_UM,
 ) -> SearchCase:
     """Make a frame with the marks of the layout, everything else random. tones: of marks that are connected to the
@@ -124,7 +124,7 @@ def make_case(
     )
 
 
-def _layout(rng: Generator, kind: str, symmetry: str) -> FiducialLayout:
+def draw_layout(rng: Generator, kind: str, symmetry: str) -> FiducialLayout:
     """Random layout of marks in the corners, or corners and sides; alike, or different by a few µm, by dots next to the
     marks, or by kind."""
     at = float(rng.uniform(10.0, 11.2))
