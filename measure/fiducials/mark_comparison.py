@@ -2,7 +2,7 @@
 
 Lens and scanner make the blur of a frame's marks uniform; marks of one drawing have size and rotation in common. A
 faint mark is matched with the blur of the others as an observation, since noise may make its edges look sharp; a speck
-that covers part of a dot changes its apparent size. A cross of a réseau plate with one short arm looks covered in every
+that covers part of a dot changes its apparent size. A cross of a réseau plate with short arms looks covered in every
 frame: with three or more frames a mark is tested against itself in the others, no longer against the other marks.
 """
 
@@ -15,7 +15,7 @@ from scipy.special import ndtr
 
 from measure.array_types import Array, Mask
 from measure.flags import FALSE_DOUBT, MARK_UNLIKE_THE_OTHERS, NO_REASON, Cause, Code, Reason, Status
-from measure.marks.rendering import picture, render
+from measure.marks.rendering import render
 from measure.marks.shapes import Bar, Disk, MarkShape, Part, Ring
 from measure.matching.models import PIXEL_VARIANCE_PX2, background_planes
 from measure.matching.window import ScanWindow
@@ -41,12 +41,10 @@ _FEWEST_FRAMES = 3  # needed: of two, either may be the outlier
 _NEAR = 3.0  # standard deviations from the median, within which frames agree
 _WIDTH_SIGMA = 0.15  # standard deviation of the logarithm of the width of a frame's lines over the drawn one
 _LEAST_WIDTH, _LONGEST_WIDTH = 0.03, 0.2  # of the same: a smaller change is ignored, a larger one is not linear
-_SHORTEST = 0.1  # lower bound of ratios: an arm shorter than this counts as missing
-_CHANGE = 0.3  # fraction of the arm's length, step of the central differences in the design matrix
 _LEAST_GAIN = 0.1  # fraction of the fitted contrast: a smaller gain is replaced by it
 _PART_STEPS, _SETTLED_PX = 12, 0.01  # steps of parts; the last one
 _PARTS_APART_PX = 0.5  # an error that a mark with status measured must not have
-_ARM, _SHAPE, _BLUR = "arm", "shape", "blur"
+_SHAPE, _BLUR = "shape", "blur"
 
 
 def blur_spread(shown: Array, marks: Array) -> Array:
@@ -268,58 +266,6 @@ def touch_of_round(shape: SharedShape, radius_px: float, px_per_mm: float, is_da
     return Touch(shape.touched(spread, is_damaged), moved, sigma)
 
 
-def measure_arms(window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fit: MarkFit) -> tuple[Array, Array]:
-    """Estimate the lengths of the arms of a cross, relative to the drawn ones, by linear least squares.
-
-    Gain, offset and slopes are further unknowns. The derivative with respect to a length is the image of a line about
-    the end of the arm, uniform along it: the estimate is proportional to the missing part, regardless of the blur.
-    Pixels masked as damage are used, since a missing arm is masked, too.
-
-    Parameters
-    ----------
-    window : window with the cross.
-    pixel_from_mark : (2, 3) in pixels of the scan. The place is the matched one. The linear part is that of the frame,
-        since the mark's own depends on the ends of its arms.
-
-    Returns
-    -------
-    (arms,) relative lengths, in the order of the bars' ends, and their standard deviations; nan of an arm whose end no
-    pixel shows.
-    """
-    place = pixel_from_mark - np.column_stack([np.zeros((2, 2)), window.origin_px])
-    height, width = window.grey.shape
-    drawn = picture(mark, place, width, height, fit.blur_px)
-    changes = [picture(tip, place, width, height, fit.blur_px) / (2 * _CHANGE) for tip in _arm_tips(mark)]
-    used = window.usable & (window.ends == 0)
-    design = np.stack([*changes, drawn, *background_planes(height, width)])[:, used]
-    grey = window.grey[used]
-    normal = design @ design.T
-    inverse: Array = np.asarray(np.linalg.pinv(normal), float)
-    solution = inverse @ (design @ grey)
-    left = grey - solution @ design
-    # Noise correlated by rho along columns and rows reduces the effective number of pixels.
-    rho = float(np.clip(fit.neighbour_correlation, 0.0, 0.9))
-    variance = float(left @ left) / max(len(grey) - len(design), 1) * ((1 + rho) / (1 - rho)) ** 2
-    gain = solution[len(changes)]
-    gain = gain if abs(gain) > _LEAST_GAIN * abs(fit.contrast_dn) else fit.contrast_dn
-    # At least 1 for each unknown that the pixels show; the pseudo-inverse holds nothing of the others.
-    is_shown = np.diag(normal) * np.diag(inverse) > 0.5
-    sigmas = np.sqrt(variance * np.where(is_shown, np.diag(inverse), np.nan)[: len(changes)]) / abs(gain)
-    return 1 + solution[: len(changes)] / gain, sigmas
-
-
-def _arm_tips(mark: MarkShape) -> list[MarkShape]:
-    """For each arm: what it has more if it is longer than if it is shorter, the line about its end."""
-    tips = list[MarkShape]()
-    for bar in mark.parts:
-        assert isinstance(bar, Bar)
-        for tip, other in ((bar.from_mm, bar.to_mm), (bar.to_mm, bar.from_mm)):
-            if np.dot(tip, np.subtract(tip, other)) > 0:  # the start of an arm near the centre is no tip
-                inner, outer = ((tip[0] * share, tip[1] * share) for share in (1 - _CHANGE, 1 + _CHANGE))
-                tips.append(replace(mark, parts=(Bar(inner, outer, bar.line_mm),)))
-    return tips
-
-
 def measure_parts(
     window: ScanWindow, mark: MarkShape, pixel_from_mark: Array, fit: MarkFit
 ) -> tuple[Array, Array] | None:
@@ -329,7 +275,8 @@ def measure_parts(
 
     Parameters
     ----------
-    window, pixel_from_mark : as for `measure_arms`.
+    window : window with the mark.
+    pixel_from_mark : (2, 3) in pixels of the scan: the matched place, and the linear part of the frame.
 
     Returns
     -------
@@ -414,14 +361,12 @@ def check_own_figures(frames: Sequence[FrameMeasurement]) -> list[FrameMeasureme
         compared[key] = compare_frames(values, sigmas, key[1])
     tests = sum(len(figures[key]) for key, own in compared.items() if own is not None)
     findings: list[dict[str, dict[str, Reason]]] = [defaultdict(dict) for _ in frames]
-    arms = defaultdict[str, list[float]](list)
     for (point, kind), own in compared.items():
         if own is None:
             continue
-        value, off, off_sigmas = own
+        off, off_sigmas = own
         p_values = 2 * ndtr(-np.abs(off / off_sigmas)) * tests
         speaks_for = _BLUR if kind == _BLUR else _SHAPE
-        arms[point] += [value] if kind.startswith(_ARM) else []
         for (place, *_), one, p_value in zip(figures[point, kind], off.tolist(), p_values.tolist(), strict=True):
             finding, reason = findings[place][point], _unlike_frames(kind, one) if p_value < FALSE_DOUBT else NO_REASON
             finding[speaks_for] = finding.get(speaks_for) or reason
@@ -429,56 +374,50 @@ def check_own_figures(frames: Sequence[FrameMeasurement]) -> list[FrameMeasureme
         replace(
             frame,
             marks=tuple(
-                _assess(mark, found.get(mark.point, {}), arms[mark.point]) if mark.kind == "fiducial" else mark
-                for mark in frame.marks
+                _assess(mark, found.get(mark.point, {})) if mark.kind == "fiducial" else mark for mark in frame.marks
             ),
         )
         for frame, found in zip(frames, findings, strict=True)
     ]
 
 
-def compare_frames(values: Array, sigmas: Array, kind: str) -> tuple[float, Array, Array] | None:
+def compare_frames(values: Array, sigmas: Array, kind: str) -> tuple[Array, Array] | None:
     """Compare a figure of a mark, logarithm of a ratio or rotation (rad), with that in the other frames that agree.
 
     Parameters
     ----------
     values, sigmas : (n,) in the frames, with standard deviations.
-    kind : of the figure: size, turn, blur, arm1, arm2, ...
+    kind : of the figure: size, turn or blur.
 
     Returns
     -------
-    Mean; (n,) deviation of each frame from the mean of the others, and its standard deviation. None for fewer than
-    three frames, or if no more than half of them agree.
+    (n,) deviation of each frame from the mean of the others, and its standard deviation. None for fewer than three
+    frames, or if no more than half of them agree.
     """
     spread = blur_spread if kind == _BLUR else size_spread
     near = _NEAR * np.hypot(sigmas, spread(np.zeros(1), np.ones(1)))
     agrees = np.abs(values - np.median(values)) <= near
     if len(values) < _FEWEST_FRAMES or 2 * agrees.sum() <= len(values):
         return None
-    value, _, apart = mean_of_unlike(values, sigmas, agrees, spread)
+    *_, apart = mean_of_unlike(values, sigmas, agrees, spread)
     weights = agrees / (sigmas**2 + apart**2)
     others = weights.sum() - weights
     off = values - (weights @ values - weights * values) / others
-    return float(value), off, np.sqrt(1 / others + sigmas**2 + apart**2)
+    return off, np.sqrt(1 / others + sigmas**2 + apart**2)
 
 
 def _figures(frame: FrameMeasurement) -> dict[tuple[str, str], tuple[float, float]]:
-    """Figures of fiducials, as in an unmirrored scan and with arms relative to the frame's, and their sigmas."""
+    """Figures of fiducials, as in an unmirrored scan, and their standard deviations."""
     mirrored = -1.0 if frame.pose and frame.pose.name.endswith("m") else 1.0
     figures: dict[tuple[str, str], tuple[float, float]] = {}
     for mark in frame.marks:
         if mark.kind == "fiducial" and mark.status.is_observation:
-            own = {name: value for name, value in mark.quality.items() if name.endswith("_ratio")}
-            if "arm1_ratio" in own:
-                del own["size_ratio"]
-            for name, ratio in own.items():
-                kind = name.removesuffix("_ratio")
-                figures[mark.point, kind] = float(np.log(max(ratio, _SHORTEST))), mark.quality[f"{kind}_sigma"]
+            for kind in ("size", "blur"):
+                if f"{kind}_ratio" in mark.quality:
+                    figures[mark.point, kind] = np.log(mark.quality[f"{kind}_ratio"]), mark.quality[f"{kind}_sigma"]
             if "turn_rad" in mark.quality:
                 figures[mark.point, "turn"] = mirrored * mark.quality["turn_rad"], mark.quality["turn_sigma"]
-    arms = [key for key in figures if key[1].startswith(_ARM)]
-    usual = float(np.median([figures[key][0] for key in arms])) if arms else 0.0
-    return figures | {key: (figures[key][0] - usual, figures[key][1]) for key in arms}
+    return figures
 
 
 def _unlike_frames(kind: str, off: float) -> Reason:
@@ -486,16 +425,14 @@ def _unlike_frames(kind: str, off: float) -> Reason:
     there, covered = "in the camera's other frames", "something may cover or touch it"
     if kind == _BLUR:
         return Reason(f"its blur is {np.exp(off):.2f} times that {there}", Code.BLUR)
+    figure = f"it is {np.exp(off):.2f} times as large as {there}"
     if kind == "turn":
         figure = f"it is turned by {np.degrees(off):.1f} degrees against what it is {there}"
-    else:
-        long = "it is {:.2f} times as large as" if kind == "size" else "one of its arms is {:.2f} times as long as"
-        figure = f"{long.format(np.exp(off))} {there}"
     return Reason(f"{figure}: {covered}", Code.SIZE, Code.COVERED)
 
 
-def _assess(mark: MarkMeasurement, findings: Mapping[str, Reason], arms: Sequence[float]) -> MarkMeasurement:
-    """Update the status of a mark. findings: reasons by kind, empty if frames agree; arms: log lengths on the plate."""
+def _assess(mark: MarkMeasurement, findings: Mapping[str, Reason]) -> MarkMeasurement:
+    """Update the status of a mark. findings: reasons by kind, empty if frames agree."""
     quality, unlike = mark.quality, findings.get(_SHAPE, NO_REASON)
     if unlike and Code.SIZE not in mark.reason.codes:
         return replace(mark, status=Status.WEAK, reason=Reason.combine((mark.reason, unlike)))
@@ -503,11 +440,7 @@ def _assess(mark: MarkMeasurement, findings: Mapping[str, Reason], arms: Sequenc
     if not findings.get(_BLUR, True):
         settled.add(unlike_blur(quality["blur_ratio"]))
     if not findings.get(_SHAPE, True):
-        # The arms of a cross have to explain its size: a match yields a size between those of its arms.
-        size = float(np.log(quality["size_ratio"]))
-        near = _NEAR * float(np.hypot(quality["size_sigma"], _SIZE_SPREAD))
-        if not arms or min(arms) - near <= size <= max(arms) + near:
-            settled.add(unlike_others(quality["size_ratio"], quality.get("turn_rad")))
+        settled.add(unlike_others(quality["size_ratio"], quality.get("turn_rad")))
     if not (mark.status is Status.WEAK and settled.issuperset(mark.reason.split("; "))):
         return mark
     own = None if mark.covariance is None else mark.covariance.without(Cause.SMEAR)

@@ -27,7 +27,6 @@ from measure.fiducials.mark_comparison import (
     SharedShape,
     Touch,
     lines_and_rounds,
-    measure_arms,
     measure_parts,
     parts_apart,
     shared_blurs,
@@ -63,7 +62,7 @@ from measure.marks.shapes import (
     widen_lines,
 )
 from measure.matching.models import PIXEL_VARIANCE_PX2, MatchOptions
-from measure.matching.window import ScanWindow, read_window
+from measure.matching.window import read_window
 from measure.noise.noise_model import may_be_noise
 from measure.results import MarkFit, largest_sigma_px
 from measure.scans.parallel import map_in_threads
@@ -809,19 +808,12 @@ def _compare_parts(frame: Frame) -> Frame:
     for index, fit in frame.clear_fits.items():
         mark = frame.layout.marks[index].mark
         if isinstance(mark, MarkShape) and lines_and_rounds(mark):
-            found = measure_parts(*_window_of(frame, index, fit), fit)
+            place = np.column_stack([frame.linear(index), fit.center_px])
+            bounds = mark_window(mark, place, frame.options.match.margin_px)
+            found = measure_parts(read_window(frame.scan, bounds, frame.weights), mark, place, fit)
             reason, px2 = parts_apart(*found) if found else (NO_REASON, np.zeros((2, 2)))
             amended[index] = frame.detections[index].amend(reason, parts={Cause.MODEL_MISFIT: px2})
     return frame.replace_detections(amended)
-
-
-def _window_of(frame: Frame, index: int, fit: MarkFit) -> tuple[ScanWindow, MarkShape, Array]:
-    """Window of a drawn mark at its fitted place, its drawing, and its (2, 3) placement with the frame's linear
-    part."""
-    mark = frame.layout.marks[index].mark
-    assert isinstance(mark, MarkShape)
-    place = np.column_stack([frame.linear(index), fit.center_px])
-    return read_window(frame.scan, mark_window(mark, place, frame.options.match.margin_px), frame.weights), mark, place
 
 
 def compare_shapes(frame: Frame) -> Frame:
@@ -857,10 +849,6 @@ def _doubt_shape(frame: Frame, index: int, fit: MarkFit, shape: SharedShape, sig
     size_ratio = float(np.exp(np.clip(shape.off[0], -_MOST_UNEQUAL, _MOST_UNEQUAL)))
     figures = dict(zip(("size_ratio", "turn_rad"), (size_ratio, *shape.off[1:].tolist()), strict=False))
     figures |= dict(zip(("size_sigma", "turn_sigma"), sigma.tolist(), strict=False))
-    if isinstance(mark, MarkShape) and mark.is_cross:
-        arms = zip(*measure_arms(*_window_of(frame, index, fit), fit), strict=True)
-        for number, (length, sigma_length) in enumerate(arms, 1):
-            figures |= {f"arm{number}_ratio": float(length), f"arm{number}_sigma": float(sigma_length)}
     if fit.own_shape is not None and mark.is_held_by_frame:
         middle_px = reach_px(mark, fit.pixel_from_mark[:, :2]) / 2
         moved_px = float(np.hypot(*(fit.own_shape.on_place @ shape.off)))
