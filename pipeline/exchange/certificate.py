@@ -10,8 +10,8 @@ a decentering part P = -k_n d R^(n-3) 6 (3 n + 1) / (10 (n + 3)), fitted over th
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
@@ -23,6 +23,7 @@ from adjust.problem.camera import FiducialDistance
 from adjust.quality.lens_uncertainty import balanced_distance
 from measure.marks.shapes import Point
 from pipeline.errors import InputError
+from pipeline.exchange.distance_figure import figure_from_distances
 from pipeline.exchange.formats import Convention
 from pipeline.exchange.incoming import ImportOptions, Incoming
 from pipeline.files.camera_file import CameraFile, GivenFiducial, fiducial_distances
@@ -43,6 +44,7 @@ _CURVE = 400  # samples of the curve whose extremes are balanced
 NUMBERS = Key("list of numbers", numbers)
 REACH_MM = (10.0, 500.0)  # from the axis to the last value of a table, of any film camera
 SMALLEST_UM = 0.1  # largest distortion of a table; no camera has less
+DISTANCE_SIGMA_MM = 0.01  # of a distance between fiducials, where none is given
 MARKS_REACH = 4.0  # of a table and its fiducials: largest ratio
 
 
@@ -86,7 +88,8 @@ class Certificate:
     """Certificate as printed: the distortions at angles or at radii, and one principal point or two.
 
     sigma_um: standard deviation of one value; principal_point_mm: the only point of a certificate; else
-    autocollimation_mm and symmetry_mm.
+    autocollimation_mm and symmetry_mm; fiducial_distance_mm: distances "1-2" between fiducials, of one standard
+    deviation.
     """
 
     name: str = ""
@@ -102,6 +105,8 @@ class Certificate:
     symmetry_mm: Point | None = None
     fiducial: tuple[FiducialTable, ...] = ()
     fiducial_distance: tuple[FiducialDistanceTable, ...] = ()
+    fiducial_distance_mm: Mapping[str, Positive] = field(default_factory=dict)
+    fiducial_distance_sigma_mm: Positive = DISTANCE_SIGMA_MM
 
     def __post_init__(self) -> None:
         """Raises WrongKey for keys that are missing or contradict each other."""
@@ -120,6 +125,15 @@ class Certificate:
             raise WrongKey(key, "must be positive and different: leave out the axis, and what is there twice.")
         if self.angle_deg and max(self.angle_deg) >= 90.0:
             raise WrongKey(key, "must lie below 90 degrees.")
+        ids = [one.id for one in self.fiducial]
+        for name in self.fiducial_distance_mm:
+            ends = name.split("-")
+            if len(ends) != 2 or ends[0] == ends[1] or (ids and not {*ends} <= {*ids}):
+                raise WrongKey(
+                    "fiducial_distance_mm",
+                    f'has {name!r}: write the names of two fiducials, "1-2" = 299.81. Where a name has a hyphen, '
+                    "[[fiducial_distance]] with from, to, mm and sigma_mm.",
+                )
         self._check_units(key)
         has_two = self.autocollimation_mm is not None or self.symmetry_mm is not None
         if self.principal_point_mm is not None and has_two:
@@ -140,7 +154,7 @@ class Certificate:
         )
         if not REACH_MM[0] < reach_mm < REACH_MM[1]:
             raise WrongKey(key, f"or the principal distance has another unit: {given}. Give degrees and mm.")
-        marks_mm = max((math.hypot(*one.xy_mm) for one in self.fiducial), default=reach_mm)
+        marks_mm = max((math.hypot(*one.xy_mm) for one in self.fiducials), default=reach_mm)
         if not reach_mm / MARKS_REACH < marks_mm < MARKS_REACH * reach_mm:
             raise WrongKey(
                 key, f"or xy_mm of the fiducials has another unit: {given}, the fiducials to {marks_mm:.4g} mm."
@@ -171,9 +185,32 @@ class Certificate:
         radius_mm = np.array(self.radius_mm, dtype=float)
         return radius_mm, (radius_mm - radial_mm) / self.distance_mm, radial_mm
 
-    @property
+    @cached_property
     def distances(self) -> tuple[FiducialDistance, ...]:
-        return tuple(FiducialDistance(one.start, one.end, one.mm, one.sigma_mm) for one in self.fiducial_distance)
+        tables = [FiducialDistance(one.start, one.end, one.mm, one.sigma_mm) for one in self.fiducial_distance]
+        sigma_mm = self.fiducial_distance_sigma_mm
+        return *tables, *(
+            FiducialDistance(start, end, mm, sigma_mm)
+            for name, mm in self.fiducial_distance_mm.items()
+            for start, _, end in [name.partition("-")]
+        )
+
+    @cached_property
+    def fiducials(self) -> tuple[FiducialTable, ...]:
+        """The fiducials, where only distances are given with the coordinates that these tell. Raises WrongKey where
+        they tell none."""
+        if self.fiducial or not self.distances:
+            return self.fiducial
+        ids = list(dict.fromkeys(name for one in self.distances for name in (one.start, one.end)))
+        xy_mm = figure_from_distances(ids, self.distances)
+        if xy_mm is None:
+            raise WrongKey(
+                "fiducial_distance_mm" if self.fiducial_distance_mm else "fiducial_distance",
+                f"does not tell where the {len(ids)} fiducials lie. Add distances, or approximate coordinates as "
+                "[[fiducial]] with id and xy_mm.",
+            )
+        places = ((float(x), float(y)) for x, y in xy_mm)
+        return tuple(FiducialTable(id=name, xy_mm=place) for name, place in zip(ids, places, strict=True))
 
 
 def read_certificate(path: Path) -> Certificate:
@@ -181,7 +218,7 @@ def read_certificate(path: Path) -> Certificate:
     and radii, and for lists of different lengths."""
     table = read_toml(path)
     given = read_model(table, Certificate)
-    fiducial_distances(table.tables("fiducial_distance"), given.fiducial_distance, [one.id for one in given.fiducial])
+    fiducial_distances(table.tables("fiducial_distance"), given.fiducial_distance, [one.id for one in given.fiducials])
     return replace(given, name=given.name or path.stem)
 
 
@@ -247,7 +284,7 @@ def _camera(certificate: Certificate, fitted: FittedTable) -> CameraFile:
         principal_distance_sigma_mm=float(fitted.sigmas[0]),
         principal_point_sigma_mm=(point_sigma, point_sigma),
         distortion=Distortion("torlegard", {name: Prior(k, sigma) for name, k, sigma in given if sigma > 0.0} | off),
-        fiducials=tuple(GivenFiducial(one.id, one.xy_mm, one.sigma_mm, None) for one in certificate.fiducial),
+        fiducials=tuple(GivenFiducial(one.id, one.xy_mm, one.sigma_mm, None) for one in certificate.fiducials),
         distances=certificate.distances,
     )
 
@@ -275,7 +312,21 @@ def _notes(certificate: Certificate, fitted: FittedTable) -> list[str]:
         f"{largest:.2f} µm at most, {over} values more than unknowns.",
         f"{certificate.name}: the certificate {point}.",
         *([apart] if off.any() else []),
+        *_distance_notes(certificate),
     ]
+
+
+def _distance_notes(certificate: Certificate) -> list[str]:
+    notes = []
+    if certificate.fiducials and not certificate.fiducial:
+        notes.append(
+            f"{certificate.name}: gives no coordinates of fiducials. They are approximated by the distances, with "
+            f"{certificate.fiducials[0].id} at the lower left: turn or mirror them if it lies elsewhere."
+        )
+    if certificate.fiducial_distance_mm:
+        sigma_mm = certificate.fiducial_distance_sigma_mm
+        notes.append(f"{certificate.name}: each distance has a standard deviation of {sigma_mm:g} mm.")
+    return notes
 
 
 def _residuals(certificate: Certificate, fitted: FittedTable) -> str:

@@ -2,6 +2,7 @@
 
 import csv
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import cv2
@@ -382,6 +383,35 @@ def test_a_certificate_of_distances(tmp_path: Path) -> None:
     table.write_text(table.read_text().replace('to = "3"', 'to = "33"'))
     with pytest.raises(InputError, match=r"no fiducial '33'\. Did you mean '3'"):
         read_certificate(table)
+
+
+def test_a_certificate_of_distances_alone_places_its_marks(
+    tmp_path: Path, refusal: Refusal, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Five marks at uneven places, nine of ten distances: the figure comes back up to rotation and reflection."""
+    xy = {"1": (-106.0, -105.0), "3": (-104.0, 107.0), "2": (106.0, 106.0), "4": (105.0, -106.0), "5": (112.0, 3.0)}
+    pairs = list(combinations(xy, 2))[1:]
+    known = {f"{a}-{b}": float(np.hypot(*np.subtract(xy[a], xy[b]))) for a, b in pairs}
+    table = printed(tmp_path / "c.toml", 153.0, TABLE)
+    lines = [table.read_text(), "[fiducial_distance_mm]", *(f'"{pair}" = {mm!r}' for pair, mm in known.items())]
+    table.write_text("\n".join(lines) + "\n")
+    camera, words = read_camera(imported("certificate", [table], tmp_path) / "camera.toml"), capsys.readouterr().out
+    found = {mark.id: np.array(mark.xy_mm) for mark in camera.fiducials}
+    assert np.linalg.norm(found["3"] - found["1"]) == pytest.approx(np.hypot(2.0, 212.0), abs=1e-5)  # not among them
+    assert found["1"].max() < -100.0
+    assert found["3"][0] < 0.0 < found["3"][1]
+    assert {mark.sigma_mm for mark in camera.fiducials} == {(1.0, 1.0)}
+    assert camera.distances[0] == FiducialDistance("1", "2", known["1-2"], 0.01)
+    assert "approximated by the distances" in words
+    assert "a standard deviation of 0.01 mm" in words
+    folded = [line for line in lines[2:] if "5" not in line.split("=")[0]]  # of four marks, one of which can be folded
+    for rows, message in (
+        (['"1-2" = 299.8'], "does not tell where the 2 fiducials lie"),
+        (['"1-2-3" = 299.8'], "has '1-2-3'"),
+        (folded, "where the 4 fiducials lie"),
+    ):
+        table.write_text("\n".join([*lines[:2], *rows]) + "\n")
+        assert message in refusal("import", "certificate", table, tmp_path / "out")
 
 
 def test_a_published_table_is_fitted_to_its_rounding(tmp_path: Path) -> None:
