@@ -20,7 +20,9 @@ from measure.scans.scan import Scan
 
 _SURE = 1e-6  # false alarms below which no softer template is tried; small, since there are many marks
 _HALVED_PX = 6.0  # px, width of the finest line from which on half the resolution suffices
-_SHARP_PX, _SOFT_PX = 1.0, 2.5  # px, blurs of the two templates; a blurred thin line differs much from a sharp one
+# Blurs of the two templates, sharp and soft: a blurred thin line, or one that exposure or sharpening widened, differs
+# much from a sharp one.
+TEMPLATE_BLURS_PX = (1.0, 2.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +72,10 @@ def localise(scan: Scan, expected: MarkPrediction) -> tuple[Array, float] | None
     Column and row of the peak in the scan, with sub-pixel accuracy, and the expected number of false alarms; None if
     the peak is not significant.
     """
-    searches = [_PeakSearch(scan, expected, _SHARP_PX)]
+    sharp_px, soft_px = TEMPLATE_BLURS_PX
+    searches = [PeakSearch(scan, expected, sharp_px)]
     if searches[0].false_alarms > _SURE:
-        searches.append(_PeakSearch(scan, expected, _SOFT_PX))
+        searches.append(PeakSearch(scan, expected, soft_px))
     best = min(searches, key=lambda search: search.false_alarms)
     false_alarms = len(searches) * best.false_alarms
     return (best.center_px, false_alarms) if false_alarms <= NOISE_LIKE_A_MARK else None
@@ -80,11 +83,11 @@ def localise(scan: Scan, expected: MarkPrediction) -> tuple[Array, float] | None
 
 def highest_peak(scan: Scan, expected: MarkPrediction) -> tuple[Array, float]:
     """Column and row of the highest correlation peak within the search radius, and its height."""
-    search = _PeakSearch(scan, expected, _SHARP_PX)
+    search = PeakSearch(scan, expected, TEMPLATE_BLURS_PX[0])
     return search.center_px, search.height
 
 
-class _PeakSearch:
+class PeakSearch:
     """Highest correlation peak of a mark rendered with a blur. center_px (2,); height: NCC."""
 
     def __init__(self, scan: Scan, expected: MarkPrediction, blur_px: float) -> None:

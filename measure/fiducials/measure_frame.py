@@ -16,7 +16,7 @@ from scipy.special import chdtrc
 
 from measure.array_types import Array, Mask, Single
 from measure.detection.correlation import CLOSE
-from measure.detection.localisation import MarkPrediction, highest_peak
+from measure.detection.localisation import TEMPLATE_BLURS_PX, MarkPrediction, PeakSearch
 from measure.fiducials.channel_weights import estimate_weights
 from measure.fiducials.consistency import FrameMarks, Scatter, gross_errors
 from measure.fiducials.constellation import NARROW, Placement, mark_sign
@@ -103,6 +103,7 @@ _EXTREMES = (0.5, 99.5)  # percentiles of the grey values taken as darkest and l
 _SURROUND = 6.0  # times a mark's own extent: enough of the scan for its darkest and lightest grey values
 RANDOM_PLACES = 64  # compared beside the marks: enough to test three marks found of four
 _OFFSETS = (2.5, 4.5)  # in search radii: beyond the response of the mark itself
+_LEAST_FALSE_ALARMS = 1e-300  # has a logarithm
 FITTED_PX = 3.0  # px, largest distance between the fitted place and the correlation peak
 _STRAINED = 1 / 3  # fraction of a mark's standard deviation: a larger strain error raises it by more than a twentieth
 _BETTER_KNOWN = 2 / 3  # ratio of the standard deviations of rotation and scale after and before a refit for another one
@@ -222,9 +223,20 @@ class Frame:
         sign = mark_sign(mark.mark, self.placement.polarity)
         return MarkPrediction(mark.mark, start, search_px, sign, self.weights, self.placement.surroundings)
 
-    def response(self, index: int, place_px: Array, radius_px: float) -> float:
-        """Highest correlation of a mark, by index, within a radius of a place in the scan."""
-        return highest_peak(self.scan, self.prediction(index, radius_px).shift_to(place_px))[1]
+    def peak(self, index: int, place_px: Array, radius_px: float, blur_px: float) -> PeakSearch:
+        """Highest correlation of a mark, by index, rendered with a blur, within a radius of a place in the scan."""
+        return PeakSearch(self.scan, self.prediction(index, radius_px).shift_to(place_px), blur_px)
+
+    def fitted_peaks(self, places_px: Mapping[int, Array]) -> tuple[dict[int, float], float]:
+        """Correlations of marks, by index, about the places where they were fitted, and the blur of their template:
+        the one that stands out more from noise. Marks of one frame are equally wide."""
+        peaks = [
+            {index: self.peak(index, place, FITTED_PX, blur_px) for index, place in places_px.items()}
+            for blur_px in TEMPLATE_BLURS_PX
+        ]
+        doubts = [sum(np.log(max(each.false_alarms, _LEAST_FALSE_ALARMS)) for each in own.values()) for own in peaks]
+        best = int(np.argmin(doubts))
+        return {index: each.height for index, each in peaks[best].items()}, TEMPLATE_BLURS_PX[best]
 
     def replace_detections(self, changed: Mapping[int, Detection]) -> "Frame":
         """Return the frame with the detections of some marks replaced, by index."""
@@ -537,13 +549,11 @@ def random_matches(frame: Frame, indices: Iterable[int]) -> tuple[dict[int, int]
     ]
     within = [(index, place) for index, place in every if np.all(place >= 0) and np.all(place < size)]
     step = max(1, len(within) // RANDOM_PLACES)
-    others = [frame.response(*each, radius_px) for each in within[::step][:RANDOM_PLACES]]
-    matches = {}
-    for index in indices:
-        if fit := frame.detections[index].fit:
-            own = frame.response(index, fit.center_px, FITTED_PX)
-            matches[index] = sum(each >= own for each in others)
-    return matches, len(others)
+    own, blur_px = frame.fitted_peaks(
+        {index: fit.center_px for index in indices if (fit := frame.detections[index].fit)}
+    )
+    others = [frame.peak(*each, radius_px, blur_px).height for each in within[::step][:RANDOM_PLACES]]
+    return {index: sum(each >= height for each in others) for index, height in own.items()}, len(others)
 
 
 def detect_faint_marks(frame: Frame, reach_px: float) -> Frame:

@@ -24,7 +24,6 @@ from measure.fiducials.constellation import FREE_MARKS, NARROW, Placement, disti
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA
 from measure.fiducials.measure_frame import (
     CHECKED,
-    FITTED_PX,
     RANDOM_PLACES,
     REDUCED_PX,
     Frame,
@@ -413,9 +412,9 @@ def _share_at_full_resolution(result: SearchResult, frame: Frame, found_px: Mapp
         as_good = scan_px(as_high, responses.reduction)
         compared = as_good[: RANDOM_PLACES // len(found_px)]
         others += [(index, place) for place in compared if np.hypot(*(marks_px - place).T).min() > apart_px]
-    weakest = min(frame.response(index, place, FITTED_PX) for index, place in found_px.items())
-    radius_px = REDUCED_PX * frame.placement.reduction
-    hits = sum(frame.response(index, place, radius_px) >= weakest for index, place in others)
+    heights, blur_px = frame.fitted_peaks(found_px)
+    weakest, radius_px = min(heights.values()), REDUCED_PX * frame.placement.reduction
+    hits = sum(frame.peak(index, place, radius_px, blur_px).height >= weakest for index, place in others)
     return share_of_places(hits, len(others))
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from drawn import ALIKE, Array, brute_picture, lay_out, make_scan, measured_mark, paint
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from adjust.functional_model.transformation import FILM_NAMES, HIGHEST_ORDER, film_parameter_names
 from measure import FiducialOptions, Scan, Status
@@ -26,7 +27,7 @@ from measure.fiducials.search import FrameSearch, PitchHypothesis, SearchResult
 from measure.fiducials.stages import Kind, Stage, StageResult, doubt_frame, find_frame
 from measure.flags import MAX_FALSE_FRAMES, NO_REASON, Code, Reason
 from measure.geometry import POSES, UP_FROM_CAMERA
-from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross, dot
+from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross, dot, ring_cross
 from measure.marks.templates import cut, learn_template
 from measure.results import FrameMeasurement, MarkFit, ScanOrientation
 from measure.tone.curve import Tone
@@ -385,6 +386,18 @@ def test_specks_that_lie_as_three_marks_of_four_are_doubted_with_numbers() -> No
     sentence = doubt_frame(SearchResult(), frame)
     assert "only 3 of 4 marks were found, and 1 of 64 random places match as well (p = 0.06)" in sentence
     assert Code.NO_FRAME in sentence.codes
+
+
+def test_marks_that_a_sharpened_scan_shows_far_wider_than_drawn_stand_out_from_random_places() -> None:
+    """Lines of 8 px, drawn as 1 px, cut off by an unsharp mask, on texture: a sharp template finds but their edges."""
+    drawn, shown = (lay_out([MarkShape(ring_cross(0.5, line, 0.8, line))] * 4, CORNERS) for line in (0.05, 0.4))
+    grey, (row, col) = picture(shown, "0", hidden=0), np.indices((380, 380))
+    away = np.min([np.hypot(col - x, row - y) for x, y in centers_px(drawn, "0")], axis=0) > 24
+    grey[away] += np.random.default_rng(5).normal(0.0, 6000.0, grey.shape)[away]
+    sharpened = np.clip(grey + 2.0 * (grey - gaussian_filter(grey, 2.5)), 18000.0, 24000.0)
+    frame = make_frame_chance(make_scan(sharpened), drawn)
+    assert frame.inliers.tolist() == [False, True, True, True]
+    assert not doubt_frame(SearchResult(), frame)
 
 
 def test_a_frame_that_chance_is_likelier_to_have_made_than_not_gives_no_observation() -> None:
