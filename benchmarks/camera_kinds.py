@@ -99,6 +99,7 @@ def _sides(left: str, right: str, top: str, bottom: str) -> Mapping[str, str]:
 WILD_RING = {"drawn": ring_cross(0.80, 0.17, 1.75, 0.10, 0.08, 45)}
 WILD_PLAIN = {"drawn": cross(1.75, 0.12, 0.25, 45)}
 WILD_ALL_PLAIN = {"corner": cross(1.75, 0.12, 0.25, 45), "side": cross(1.75, 0.10, 0.27, 0)}
+WILD_ALL_RINGED = {"corner": WILD_RING["drawn"], "side": ring_cross(0.80, 0.17, 1.50, 0.10, 0.25, 0)}
 WILD_RING_SIDES = {"corner": cross(1.75, 0.12, 0.25, 45), "side": ring_cross(0.85, 0.17, 1.72, 0.09, 0.27, 0)}
 PARK = {"corner": ring_cross(0.82, 0.13, 1.42, 0.10, 0.40, 45), "side": ring_cross(0.82, 0.13, 1.38, 0.09, 0.34, 0)}
 EIGHT = dict.fromkeys(CORNERS, "corner") | dict.fromkeys(SIDES, "side")
@@ -125,10 +126,7 @@ _T12_LEFT = [
     (0.3, 2.6), (-2.75, 2.6), (-2.75, 1.95), (-3.95, 0.5), (-3.95, 0.0), (-0.95, 0.0), (-0.95, -1.2), (-2.75, -3.2),
     (-2.75, -4.2), (0.3, -4.2),
 ]  # fmt: skip
-T11_NOTCH = {
-    **_pair("notch", "dark", _FAIRCHILD_NOTCH),
-    "left": solid("dark", _T11_LEFT, mirrored=True),
-}
+T11_NOTCH = {**_pair("notch", "dark", _FAIRCHILD_NOTCH), "left": solid("dark", _T11_LEFT, mirrored=True)}
 T12_NOTCH = {**_pair("notch", "dark", _FAIRCHILD_NOTCH), "left": solid("dark", _T12_LEFT, mirrored=True)}
 NOTCHES = _sides("left", "notch", "notch-mirrored", "notch")
 CHECK = {
@@ -232,6 +230,9 @@ KINDS = (
     Kind("wild-rc10-eight", "Wild RC10 with plain corners and ringed sides", ("RC10", "RC10A", "RC10A*"),
          (88, 153, 214, 305), 228.0, CORNERS + SIDES, 0.3, 0.01, f"{OLD_WILD}; the sides: {GALLERY}", False, EIGHT,
          WILD_RING_SIDES, writing=OF_WILD),
+    Kind("wild-rc10-ringed", "Wild RC10 with ringed corners and sides", ("RC10", "RC10A", "RC10A*"), (153,), 228.0,
+         CORNERS + SIDES, 0.3, 0.01, f"{NEW_WILD}; the sides: from a scan of a Wild 15/4 UAGA-F", False, EIGHT,
+         WILD_ALL_RINGED, writing=OF_WILD),
     Kind("zeiss-rmk-a-eight", "Zeiss RMK A with corner crosses", ("RMK A 15/23", "RMK 15/23", "RMK AR 15/23"), (153,),
          234.0, CORNERS + SIDES, 0.5, 0.02, f"the sides: from a frame of 1978; the corners: {GALLERY}", False, EIGHT,
          RMK_EIGHT, writing=OF_ZEISS),
