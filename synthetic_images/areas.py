@@ -120,7 +120,7 @@ def _exact(area: Area, col0: int, row0: int, width: int, height: int, fold: int)
     corner = np.array([col0 - 0.5, row0 - 0.5])
     starts = np.concatenate([(outline - corner) * fold for outline in area])
     ends = np.concatenate([(np.roll(outline, -1, axis=0) - corner) * fold for outline in area])
-    starts, ends = _between_rows(starts, ends, rows)
+    starts, ends = _split_at_rows(starts, ends, rows)
     starts, ends = _cut_at_pixel_sides(starts, ends, columns, rows)
     middle, fall = (starts + ends) / 2, ends[:, 1] - starts[:, 1]
     inside = middle[:, 0] < columns
@@ -140,7 +140,7 @@ def _exact(area: Area, col0: int, row0: int, width: int, height: int, fold: int)
     return np.asarray(np.minimum(covered, 1.0), np.float32)
 
 
-def _between_rows(starts: Array, ends: Array, rows: int) -> tuple[Array, Array]:
+def _split_at_rows(starts: Array, ends: Array, rows: int) -> tuple[Array, Array]:
     """Clip edges to the rows of the window; the parts above and below cover nothing."""
     low, high = np.minimum(starts[:, 1], ends[:, 1]), np.maximum(starts[:, 1], ends[:, 1])
     crossing = (high > 0) & (low < rows) & (high > low)

@@ -54,7 +54,7 @@ class Background:
         plan = np.nan_to_num(self._bent(self._plan(geometry, nodes) / self.texel))  # rays above the horizon
         plan -= plan.min(axis=0) // len(self.texture) * len(self.texture)  # single precision is enough within it
         coordinates = plan.T.reshape(2, len(rows), len(columns)).astype(np.float32)
-        coordinates = _between(_between(coordinates).transpose(0, 2, 1)).transpose(0, 2, 1)
+        coordinates = _midpoints(_midpoints(coordinates).transpose(0, 2, 1)).transpose(0, 2, 1)
         inner = coordinates[:, row0 - first * NODE_PX :][:, :height, : geometry.width_px]
         x, y = np.mod(inner, np.float32(len(self.texture)))  # cv2 takes no more than 32767
         return np.asarray(cv2.remap(self.texture, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_WRAP), np.float32)
@@ -75,7 +75,7 @@ class Background:
         return np.asarray(texels + BEND_TEXELS * np.stack(bends, axis=1))
 
 
-def _between(nodes: Picture) -> Picture:
+def _midpoints(nodes: Picture) -> Picture:
     """Interpolate the last axis from every NODE_PX-th pixel to every pixel, by cubic Lagrange polynomials through four
     nodes; the first and the last two nodes serve as support only."""
     t = np.arange(NODE_PX) / NODE_PX

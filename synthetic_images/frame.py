@@ -91,7 +91,7 @@ def _advances(geometry: FrameGeometry) -> list[Array]:
 
 def _fiducial_position(fiducial: SceneFiducial, geometry: FrameGeometry) -> Position:
     center = geometry.pixel_from_camera(np.array([fiducial.xy_mm]))[0]
-    hidden = _beyond_scan(geometry, _mark_extent(fiducial, geometry))
+    hidden = _hidden_by_edge(geometry, _mark_extent(fiducial, geometry))
     if fiducial.id in geometry.image.covered:
         hidden = "covered"
     return Position(center, center, hidden)
@@ -107,7 +107,7 @@ def _mark_extent(fiducial: SceneFiducial, geometry: FrameGeometry) -> tuple[int,
     return bounds(((geometry.pixel_from_camera(np.array([fiducial.xy_mm])),),))
 
 
-def _beyond_scan(geometry: FrameGeometry, window: tuple[int, int, int, int]) -> str:
+def _hidden_by_edge(geometry: FrameGeometry, window: tuple[int, int, int, int]) -> str:
     col0, row0, width, height = window
     if col0 >= geometry.width_px or row0 >= geometry.height_px or col0 + width <= 0 or row0 + height <= 0:
         return "off the scan"
@@ -151,7 +151,7 @@ def _hidden(geometry: FrameGeometry, target: Target, outline_px: Array) -> str:
     """Why a target is not wholly visible, other targets aside; "" if it is."""
     if target.normal @ (np.asarray(geometry.image.exterior[:3]) - target.center) <= 0.0:
         return "faces away"
-    beyond = _beyond_scan(geometry, bounds(((outline_px,),)))
+    beyond = _hidden_by_edge(geometry, bounds(((outline_px,),)))
     if beyond:
         return beyond
     if not _inside_frame(geometry, outline_px):

@@ -38,7 +38,7 @@ class Terrain:
         """(n, 2) derivatives of the heights with respect to X and Y."""
         return np.asarray((np.cos(plan @ self.waves.T + self.phases_rad) * self.amplitudes) @ self.waves)
 
-    def met(self, station: Array, rays: Array) -> Array:
+    def intersections(self, station: Array, rays: Array) -> Array:
         """(n, 3) intersections of rays (n, 3) from a station (3,) with the terrain, by Newton's method; nan without."""
         fall = np.where(rays[:, 2] < 0.0, rays[:, 2], np.nan)
         reach = (self.ground - station[2]) / fall
@@ -77,7 +77,7 @@ def object_from_pixel(geometry: FrameGeometry, pixels: Array) -> Array:
     station = np.asarray(geometry.image.exterior[:3])
     camera_mm = geometry.camera_from_scan(pixels)
     rays = ray_from_camera(geometry.scene.camera, geometry.image.exterior, camera_mm)
-    return scene_terrain(geometry.scene).met(station, rays)
+    return scene_terrain(geometry.scene).intersections(station, rays)
 
 
 def transferred(pixels: Array, start: FrameGeometry, end: FrameGeometry) -> Array:

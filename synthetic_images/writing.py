@@ -41,9 +41,9 @@ def check_font(what: str, font: str) -> None:
 def written_area(text: str, font: str) -> Area:
     """Area of a line of text, x right and y up, centred on the origin; capitals have height 1."""
     if font == HANDWRITING:
-        outlines = _by_hand(text)
+        outlines = _handwriting(text)
     elif font in HERSHEY:
-        outlines = _drawn(text, HERSHEY[font])
+        outlines = _letter_outlines(text, HERSHEY[font])
     else:
         outlines = _outlined(text, font)
     vertices = np.concatenate(outlines)
@@ -51,7 +51,7 @@ def written_area(text: str, font: str) -> Area:
     return tuple(outline - middle for outline in outlines)
 
 
-def _by_hand(text: str) -> list[Array]:
+def _handwriting(text: str) -> list[Array]:
     """Outlines of handwriting, letter by letter; reproducible for the same text."""
     rng = np.random.default_rng(list(text.encode()))
     outlines, end = list[Array](), 0.0
@@ -61,7 +61,7 @@ def _by_hand(text: str) -> list[Array]:
             continue
         turn, size = rng.normal(0.0, _UNEVEN_RAD), 1.0 + rng.normal(0.0, _UNEVEN)
         linear = size * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-        own = [outline @ linear.T for outline in _drawn(letter, HERSHEY["hershey-italic"])]
+        own = [outline @ linear.T for outline in _letter_outlines(letter, HERSHEY["hershey-italic"])]
         vertices = np.concatenate(own)
         start = np.array([end - vertices[:, 0].min() + 0.1, rng.normal(0.0, _UNEVEN)])
         outlines += [outline + start for outline in own]
@@ -69,7 +69,7 @@ def _by_hand(text: str) -> list[Array]:
     return outlines
 
 
-def _drawn(text: str, font: int) -> list[Array]:
+def _letter_outlines(text: str, font: int) -> list[Array]:
     """Contours of text drawn by OpenCV, from the start of its baseline; inner contours have the opposite
     orientation."""
     scale = float(cv2.getFontScaleFromHeight(font, _CAPITAL_PX, _STROKE_PX))

@@ -222,7 +222,7 @@ def _why_no_distance(fields: Sequence[KnownField]) -> str:
             f"none shows {FEWEST} points whose X, Y and Z are known. Give an approximate principal_distance_mm, or the "
             "coordinates of more points."
         )
-    if where := _on_a_line(np.concatenate([field.xyz for field in fields])):
+    if where := _collinearity_words(np.concatenate([field.xyz for field in fields])):
         return f"all known points that they show lie {where}. Correct their coordinates."
     return (
         "they see too few known points, or look straight at a flat field, where a longer principal distance is a "
@@ -231,7 +231,7 @@ def _why_no_distance(fields: Sequence[KnownField]) -> str:
     )
 
 
-def _on_a_line(xyz: Array) -> str:
+def _collinearity_words(xyz: Array) -> str:
     """Whether points (n, 3) lie on one line or at one place, in words; "" if neither."""
     extents = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
     if extents[1] > ON_A_LINE * extents[0]:
@@ -384,7 +384,7 @@ def _why_not_oriented(block: BlockState, image: str) -> str:
         return f"image {image} sees {len(xyz)} known points; resection needs 3, and 4 to be unique. Either {remedy}"
     if len(xyz) == 3:
         return f"image {image} sees 3 known points, which leave several orientations or none. Either {remedy}"
-    if where := _on_a_line(xyz):
+    if where := _collinearity_words(xyz):
         return (
             f"image {image} sees {len(xyz)} known points, and all lie {where}. Correct their coordinates, or {remedy}"
         )

@@ -131,7 +131,7 @@ class MisfitPattern:
         right[frame.places] -= weights[place] @ frame.marks.off_mm.ravel()
         covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
         if is_pooled:
-            covariance = self._beyond_affine @ covariance @ self._beyond_affine
+            covariance = self._affine_complement @ covariance @ self._affine_complement
         expected, marks = (covariance @ right)[frame.places].reshape(-1, 2), frame.enlarged_marks
         return replace(marks, off_mm=marks.off_mm - expected, shared_mm2=covariance[own])
 
@@ -166,7 +166,7 @@ class MisfitPattern:
         return weights, information, right
 
     @cached_property
-    def _beyond_affine(self) -> Array:
+    def _affine_complement(self) -> Array:
         """(2m, 2m) projection on the complement of affine transformations of the sites."""
         design = np.kron(np.column_stack([self.places_mm, np.ones(len(self.places_mm))]), np.eye(2))
         return np.eye(len(design)) - design @ np.linalg.pinv(design)
@@ -455,7 +455,7 @@ def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) ->
         each.film_mm or each.off_mm.any() for each in by_places.frames.values()
     )
     if len({each.pose for each in frames.values()}) > 1 and (has_outliers or not is_clear):
-        sites, turned = _in_scan_axes(frames, given_mm)
+        sites, turned = _turn_to_scan_axes(frames, given_mm)
         by_scanner = explain_by_pattern(turned, MisfitPattern(sites, np.zeros(len(sites))), film_mm)
         lead = by_scanner.log_evidence - by_places.log_evidence
         if lead > NAMED and by_scanner.pattern.p_value < FALSE_DOUBT:
@@ -480,7 +480,7 @@ def _explain_together(frames: Frames, layout: FiducialLayout, film_mm: float) ->
     )
 
 
-def _in_scan_axes(frames: Frames, given_mm: Array) -> tuple[Array, dict[int, FrameMisfit]]:
+def _turn_to_scan_axes(frames: Frames, given_mm: Array) -> tuple[Array, dict[int, FrameMisfit]]:
     """(m, 2) sites of the marks of all frames in the scan's axes; and the frames in these axes, each mark at the
     nearest site, with the variances of its given place added."""
     places = [each.marks.given_mm @ UP_FROM_CAMERA[each.pose].T for each in frames.values()]

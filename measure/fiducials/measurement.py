@@ -82,7 +82,7 @@ def measure_fiducials(
     if beyond:
         inside = tuple(click for click in options.clicks if click not in beyond)
         measured = measure_fiducials(scan, layout, pitch_um, replace(options, clicks=inside))
-        return replace(measured, problems=(*map(_beyond, beyond), *measured.problems))
+        return replace(measured, problems=(*map(_outside_problem, beyond), *measured.problems))
     clicked = clicked_frame(scan, layout, pitch_um, options) if options.clicks else None
     if clicked is None:
         return _place_clicked_marks(_search_frame(scan, layout, pitch_um, options), options.clicks)
@@ -96,7 +96,7 @@ def measure_fiducials(
     return replace(shown, marks=marks, problems=(contradiction.reword(f"{contradiction}."), *shown.problems))
 
 
-def _beyond(click: Click) -> Reason:
+def _outside_problem(click: Click) -> Reason:
     return Reason(
         f"The place to which a person pointed for mark {click.point} is outside of the scan, and not used. Point to "
         "the mark again.",

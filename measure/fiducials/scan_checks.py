@@ -84,7 +84,7 @@ def other_frames(scan: Scan, layout: FiducialLayout, frame: FrameMeasurement, op
     alone = replace(options, clicks=(), writing="none", known_lines=())
     while rests:
         rest = rests.pop(0)
-        is_known = any(_is_within(rest, each) for each in empty)
+        is_known = any(_contains(each, rest) for each in empty)
         if is_known or rest[2] < _ROOM * width or rest[3] < _ROOM * height:
             continue
         lens = None if options.lens is None else options.lens.crop(*rest[:2])
@@ -128,10 +128,10 @@ def _rests(areas: Sequence[Window], outline: Array) -> list[Window]:
     return list(dict.fromkeys(rests))
 
 
-def _is_within(window: Window, other: Window) -> bool:
-    (col, row, width, height), (col0, row0, other_width, other_height) = window, other
-    across = col0 <= col and col + width <= col0 + other_width
-    return across and row0 <= row and row + height <= row0 + other_height
+def _contains(outer: Window, inner: Window) -> bool:
+    (col0, row0, outer_width, outer_height), (col, row, width, height) = outer, inner
+    across = col0 <= col and col + width <= col0 + outer_width
+    return across and row0 <= row and row + height <= row0 + outer_height
 
 
 def _outline(frame: FrameMeasurement, layout: FiducialLayout) -> Array:

@@ -190,7 +190,7 @@ def _precision(fit: PictureFit, noise: NoiseModel, background: BackgroundTexture
     freedom, blur = model.options.freedom, model.blur
     tells_shape = freedom in ("similarity", "affine") and not model.mark.is_round
     shape, strain = slice(2, 4), slice(4, model.linear.stop)
-    by_width, width = _by_line_width(fit), None
+    by_width, width = _line_width_derivative(fit), None
     if len(by_width) and blur is not None and model.blur_is_at_limit:
         width = line_width(linear, by_width[0], blur)
     sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -213,7 +213,7 @@ def _precision(fit: PictureFit, noise: NoiseModel, background: BackgroundTexture
     }
 
 
-def _by_line_width(fit: PictureFit) -> Array:
+def _line_width_derivative(fit: PictureFit) -> Array:
     """(n, height, width) derivative by the logarithm of the width of a cross's lines; n is 0 for other marks."""
     model = fit.model
     height, width = model.grey.shape

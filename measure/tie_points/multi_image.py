@@ -241,9 +241,9 @@ class _JointMatch(FitModel):
         by_col, by_row = self._slopes()
         u, v = self.grid[self.used].T
         columns = [by_col, by_row, by_col * u, by_col * v, by_row * u, by_row * v]
-        return self._without_gain_and_offset(np.stack(columns, axis=2))
+        return self._eliminate_gain_and_offset(np.stack(columns, axis=2))
 
-    def _without_gain_and_offset(self, design: Array) -> Array:
+    def _eliminate_gain_and_offset(self, design: Array) -> Array:
         """Remove the components that a gain and an offset explain."""
         patch = self.values.mean(axis=0)[self.used]
         grey = np.linalg.qr(np.stack([np.ones_like(patch), patch], axis=1))[0]
@@ -307,7 +307,7 @@ class _JointMatch(FitModel):
         noise covariance is singular, as for images copied from each other."""
         u, v = self.grid[self.used].T / RADIUS_PX
         columns_of_forms = [slope * form for slope in self._slopes() for form in (u * u, u * v, v * v)]
-        single, bent = self._affine_derivatives(), self._without_gain_and_offset(np.stack(columns_of_forms, axis=2))
+        single, bent = self._affine_derivatives(), self._eliminate_gain_and_offset(np.stack(columns_of_forms, axis=2))
         through = np.asarray(np.linalg.solve(self.normal, _products(single, bent)), np.float64)
         response = _products(bent, bent) - _products(single, bent).T @ through
         columns = np.zeros((bent.shape[2], *self.used.shape))
