@@ -27,6 +27,7 @@ from pipeline.text.wording import counted, did_you_mean, listed
 
 OTHER_UNIT = 5.0  # ratio of lengths: film and paper deform by some percent; the nearest other unit (cm) is 10
 FEWEST_TARGETS = 3  # in an image without observed exterior orientation
+FEWEST_OF_BOARD = 4  # three given points leave several orientations, and a board has no others
 
 
 def _check_marks(project: Project, marks: Sequence[ComparatorPoint]) -> None:
@@ -85,7 +86,8 @@ def build_network(project: Project, marks: Sequence[ComparatorPoint]) -> tuple[N
     by_name = {name: _image(project, name) for name in dict.fromkeys(mark.image for mark in used)}
     used, unjoined = _joinable(comparator, by_name, used)
     used, lonely = _locatable(given, by_name, used)
-    used, left_out = _orientable(comparator, by_name, used, _expects_targets(project))
+    fewest = FEWEST_OF_BOARD if project.targets else FEWEST_TARGETS
+    used, left_out = _orientable(comparator, by_name, used, fewest, _expects_targets(project))
     in_order = [by_name[name] for name in dict.fromkeys(mark.image for mark in used)]
     first = {image.frame: rank for rank, image in reversed(list(enumerate(in_order)))}
     images = tuple(sorted(in_order, key=lambda image: first[image.frame]))
@@ -146,7 +148,11 @@ def _locatable(
 
 
 def _orientable(
-    comparator: Path, images: Mapping[str, Image], marks: Sequence[ComparatorPoint], expects_targets: bool
+    comparator: Path,
+    images: Mapping[str, Image],
+    marks: Sequence[ComparatorPoint],
+    fewest: int,
+    expects_targets: bool,
 ) -> tuple[list[ComparatorPoint], tuple[str, ...]]:
     """Drop marks of images that cannot be oriented, with a sentence on each."""
     # Of an image with too few targets the fiducials remain if they suffice for its film deformation model. Marks in
@@ -157,10 +163,11 @@ def _orientable(
     frames = dict.fromkeys(images[mark.image].frame for mark in marks)
     first = {images[mark.image].frame: images[mark.image] for mark in reversed(marks)}
     whole = [replace(first[frame], name=frame) for frame in frames]
-    few = [image for image in whole if targets[image.name] < FEWEST_TARGETS and not image.is_observed]
+    least = {image.name: fewest if image.exterior is None else FEWEST_TARGETS for image in whole}
+    few = [image for image in whole if targets[image.name] < least[image.name] and not image.is_observed]
     lost = [image for image in few if not _has_film_transformation(image, fiducials[image.name])]
     if len(lost) == len(whole):
-        raise InputError(f"{comparator}: {_why_nothing(lost, targets, fiducials)}")
+        raise InputError(f"{comparator}: {_why_nothing(lost, least, targets, fiducials)}")
     needed = {image.name: fewest_marks(image.transformation) for image in whole}
     short = [image for image in whole if image not in few and fiducials[image.name] < needed[image.name]]
     if len(lost) + len(short) == len(whole):
@@ -173,13 +180,14 @@ def _orientable(
     ]
     sentences += [
         f"Image {image.name!r} has no part in the adjustment: it shows {counted(targets[image.name], 'target')} and "
-        f"needs {FEWEST_TARGETS}. Look at the reasons of its marks; or observe its orientation in images.csv, with "
+        f"needs {least[image.name]}. Look at the reasons of its marks; or observe its orientation in images.csv, with "
         "standard deviations."
         for image in lost
     ]
     sentences += [
         f"Image {image.name!r} is not oriented: it shows {counted(targets[image.name], 'target')} and needs "
-        f"{FEWEST_TARGETS}. Its film transformation is adjusted from its fiducials. Look at the reasons of its targets."
+        f"{least[image.name]}. Its film transformation is adjusted from its fiducials. Look at the reasons of its "
+        "targets."
         for image in few
         if image not in lost and expects_targets
     ]
@@ -250,7 +258,9 @@ def _has_film_transformation(image: Image, fiducials: int) -> bool:
     return fiducials >= max(marks_needed(image.transformation), 1)
 
 
-def _why_nothing(images: Sequence[Image], targets: Counter[str], fiducials: Counter[str]) -> str:
+def _why_nothing(
+    images: Sequence[Image], least: Mapping[str, int], targets: Counter[str], fiducials: Counter[str]
+) -> str:
     most = max(images, key=lambda image: targets[image.name])
     shown = max(images, key=lambda image: fiducials[image.name])
     marks = (
@@ -261,7 +271,7 @@ def _why_nothing(images: Sequence[Image], targets: Counter[str], fiducials: Coun
     )
     return (
         f"no image can be oriented: {most.name!r} shows the most targets, {targets[most.name]}, and an image needs "
-        f"{FEWEST_TARGETS}.{marks} See the status and reason of every mark in that file."
+        f"{least[most.name]}.{marks} See the status and reason of every mark in that file."
     )
 
 

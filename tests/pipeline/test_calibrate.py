@@ -39,6 +39,7 @@ from pipeline.calibration.calibrate_stage import CalibrationResult
 from pipeline.calibration.intrinsics import LensChoice, LensModel, choose_lens
 from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures
 from pipeline.calibration.project_files import CalibrationOptions, board_options, check_folder, write_project
+from pipeline.files.project_file import Project
 from pipeline.files.project_tables import AdjustSettings
 from pipeline.files.target_table import read_targets
 from pipeline.opencv_check.board_corners import BoardPictures, compare_corners, detector_name, find_points
@@ -415,16 +416,14 @@ def test_a_scan_stored_twice_is_none_rectified_alike(has_target: bool) -> None:
     assert not any(each.frame.problems for each in check_repeated_views(apart, False, lambda scan: drawn))
 
 
-@pytest.mark.parametrize("odd", [(), ("p3",)])
-def test_a_picture_of_another_print_is_named_and_no_other(odd: tuple[str, ...], tmp_path: Path) -> None:
-    """Its squares are 4 % wider; a lens, a drift and a bend of the board would have taken a part of that."""
+def simulated_marks(folder: Path, odd: tuple[str, ...] = ()) -> tuple[Project, list[ComparatorPoint]]:
+    """A project of pictures of a board, and marks of it; the squares of the odd pictures are 4 % wider."""
     options = CalibrationOptions(board_options("chessboard", "7x5", "20mm"))
     images = tuple(f"p{number}" for number in range(len(TURNS)))
     camera = CameraPictures("camera", *SIZE_PX, None, images)
     for name in images:
-        (tmp_path / f"{name}.png").touch()
-    files = BoardPictureFiles({name: tmp_path / f"{name}.png" for name in images}, (camera,), {})
-    project = write_project(tmp_path, files, options, {"camera": "opencv4"})
+        (folder / f"{name}.png").touch()
+    files = BoardPictureFiles({name: folder / f"{name}.png" for name in images}, (camera,), {})
     rng, marks = np.random.default_rng(3), list[ComparatorPoint]()
     for number, image in enumerate(images):
         rotation, shift = pose(number)
@@ -433,9 +432,26 @@ def test_a_picture_of_another_print_is_named_and_no_other(odd: tuple[str, ...], 
         for point, place in zip(BOARD.object_points(), places + rng.normal(0.0, 0.02, places.shape), strict=True):
             xy_mm, sigma_mm = place * [options.pixel_mm, -options.pixel_mm], np.full(2, 0.02 * options.pixel_mm)
             marks.append(ComparatorPoint(image, point, "target", xy_mm, sigma_mm, 0.0, Status.MEASURED, ""))
+    return write_project(folder, files, options, {"camera": "opencv4"}), marks
+
+
+@pytest.mark.parametrize("odd", [(), ("p3",)])
+def test_a_picture_of_another_print_is_named_and_no_other(odd: tuple[str, ...], tmp_path: Path) -> None:
+    """A lens, a drift and a bend of the board would have taken a part of that."""
+    project, marks = simulated_marks(tmp_path, odd)
     found = adjust_marks(project, marks).left_out
     assert tuple(found) == odd
     assert all("another print of the board" in why for why in found.values())
+
+
+def test_a_picture_of_three_corners_does_not_spoil_the_others(tmp_path: Path) -> None:
+    """No orientation brings these three to where they were found, which refused all pictures."""
+    project, marks = simulated_marks(tmp_path)
+    others, own = [mark for mark in marks if mark.image != "p3"], [mark for mark in marks if mark.image == "p3"]
+    wrong = [replace(mark, point=point) for mark, point in zip(own, ("r0c0", "r0c6", "r4c0"), strict=False)]
+    found = adjust_marks(project, [*others, *wrong])
+    assert found.converged
+    assert "Image 'p3' has no part in the adjustment: it shows 3 targets and needs 4." in found.remarks[0]
 
 
 def test_where_no_board_is_found_the_message_names_what_the_first_picture_shows(folder: Path, tmp_path: Path) -> None:
