@@ -81,7 +81,6 @@ def normalised_curve(result: Adjustment, case: Exact, r0_mm: float) -> Array:
 
 
 def parameter_kind(name: str) -> str:
-    """Kind of parameter of an unknown."""
     owner, quantity = name.split(".")[0], name.rsplit(".", 1)[1]
     match owner:
         case "IO":

@@ -58,7 +58,6 @@ class Truth:
 
 
 def truth_json(truth: Truth) -> str:
-    """Content of truth.json."""
     camera = truth.scene.camera
     content = {
         "scene": truth.scene.name,

@@ -82,7 +82,6 @@ def whole_file(text: str) -> str:
 
 
 def part_text(file: str, page: int | None, window: Window | None) -> str:
-    """Text of a `ScanPart`."""
     parts = [f"page={page}"] if page else []
     parts += [f"window={','.join(map(str, window))}"] if window else []
     return f"{file}#{','.join(parts)}" if parts else file

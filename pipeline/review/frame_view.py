@@ -160,7 +160,6 @@ class ReviewFrame:
 
 
 def mark_json(mark: MarkMeasurement) -> Json:
-    """JSON common to all marks."""
     return {
         "point": mark.point,
         "kind": mark.kind,

@@ -52,7 +52,6 @@ def test_what_the_model_lacks_is_named(name: str, seed: int) -> None:
 
 @pytest.mark.parametrize("seed", [2, pytest.param(14, marks=pytest.mark.study)])
 def test_nothing_else_is_blamed_with_a_stale_distortion(seed: int) -> None:
-    """A drift of focus had been, which explained nothing without the wrong k1."""
     given = faults.misfit_network(faults.scene(seed, flat=True), faults.Effects(), SOUND, np.random.default_rng(seed))
     (camera,) = given.cameras
     distortion = camera.distortion
@@ -73,7 +72,6 @@ def test_what_a_large_effect_leaves_is_blamed_on_nothing_else() -> None:
 
 
 def test_a_jump_is_found_where_it_is() -> None:
-    """Pixels that are not square, or a shear, had been blamed."""
     made = faults.scene(3, flat=True)
     given = faults.misfit_network(made, faults.Effects(jumps=0.005), SOUND, np.random.default_rng(1))
     (found,) = adjust_unmodelled(given).explanations
@@ -90,7 +88,6 @@ def test_an_estimated_noise_does_not_hide_pictures_that_moved(seed: int) -> None
 
 
 def test_affinities_of_seventy_images_own_are_tried_with_unknowns_of_these() -> None:
-    """They were tried up to 60 images, by unknowns that all images had in common."""
     scenes = [faults.scene(seed, flat=True) for seed in range(4, 20)]
     first, of_all = scenes[0], [(each, k) for each in scenes for k in range(len(each.stations))][:70]
     off = [first.points.mean(axis=0) - each.points.mean(axis=0) for each, _ in of_all]
@@ -300,7 +297,6 @@ def test_points_that_are_given_as_exact_and_are_not_are_not_named_one_by_one() -
 
 
 def test_a_boards_corner_that_is_bent_up_is_named_by_its_points() -> None:
-    """It was taken for a bend and a twist of the whole board."""
     made = faults.scene(1, flat=True)
     given = faults.misfit_network(made, faults.Effects(), SOUND, np.random.default_rng(2))
     along = (made.points[:, :2] / np.ptp(made.points[:, :2], axis=0)).sum(axis=1)
@@ -366,7 +362,6 @@ def test_a_picture_of_another_size_is_left_out_where_the_noise_is_fitted(seed: i
 
 
 def test_a_picture_of_nearly_the_size_is_left_out_after_a_grosser_one() -> None:
-    """It had stayed, since errors were smaller by far without the other alone."""
     kind, rng = replace(FITTED, frame_given=True), np.random.default_rng(12)
     given = faults.misfit_network(faults.scene(12, flat=True), faults.Effects(noise=3.0), kind, rng)
     times = np.array([{"im01": 0.5, "im04": 0.95}.get(name, 1.0) for name in given.observations.image])
@@ -543,7 +538,6 @@ def test_an_image_numbered_as_in_a_mirror_is_not_reported_to_agree_with_its_pict
 
 
 def test_a_wrong_height_is_named_where_heights_alone_are_given() -> None:
-    """Good given values, x0 and y0, had been suspects."""
     setup = nets.Setup(nets.quarters(), nets.LEVEL_STATIONS, relief=0.0, sigma=nets.HEIGHTS, prior=1.0, noise=True)
     given = faults.shift_given(setup.network()[0], "PT.3.Z", 2.0)
     result = adjust(given, options=Options(datum="minimal"))
