@@ -334,6 +334,7 @@ class _Run:
         )
 
     def thumbnails(self, data: ReportData) -> Thumbnails:
+        """Thumbnails of the marks in the data."""
         scans, path = data.measurement or {}, self.project.measurement_path
         with stored_check_run(path, data.made_from.get(path.name, "")) as check_run:
             keys = check_run.fingerprints(scans) if check_run is not None else {}

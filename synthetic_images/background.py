@@ -92,6 +92,7 @@ def _midpoints(nodes: Picture) -> Picture:
 
 
 def scene_background(scene: Scene) -> Background:
+    """Background of all frames of a scene."""
     tones = scene.tones
     texel = TEXEL_PX * max(scene.scanner.pitch_um) / 1000
     if scene.background == "plain":

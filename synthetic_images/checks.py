@@ -2,6 +2,7 @@
 
 
 def one_of(what: str, value: object, allowed: tuple[object, ...]) -> None:
+    """Check that a value is one of those allowed."""
     if value not in allowed:
         raise ValueError(f"{what}: {value!r} is none of {', '.join(repr(one) for one in allowed)}")
 

@@ -58,6 +58,7 @@ class Truth:
 
 
 def truth_json(truth: Truth) -> str:
+    """Content of truth.json."""
     camera = truth.scene.camera
     content = {
         "scene": truth.scene.name,

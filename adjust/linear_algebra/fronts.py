@@ -60,6 +60,7 @@ class Fronts:
 
     @staticmethod
     def single(count: int) -> "Fronts":
+        """A single front of all unknowns."""
         return Fronts((Front(0, count, np.empty(0, dtype=np.intp)),))
 
     def __len__(self) -> int:

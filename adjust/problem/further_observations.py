@@ -132,6 +132,7 @@ class ObservedAntenna(FurtherObservation):
 
 
 def _antennas(network: Network, unknowns: Unknowns) -> Iterator[tuple[str, ObservedAntenna]]:
+    """Antennas by frame."""
     for image in {image.frame: image for image in network.images}.values():
         exterior = image.exterior
         if exterior is None or not exterior.has_antenna or image.name in network.unoriented:

@@ -62,6 +62,7 @@ class Observations:
         return replace(self, xy_mm=self.xy_mm * signs + shifts_mm, covariance_mm2=covariance_mm2)
 
     def only(self, rows: Indices) -> "Observations":
+        """Select rows."""
         return Observations(
             tuple(self.image[row] for row in rows),
             tuple(self.point[row] for row in rows),

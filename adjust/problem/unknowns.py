@@ -269,6 +269,7 @@ class Reduction:
         return Reduction(-self.origin)
 
     def network(self, network: Network) -> Network:
+        """Reduce a network."""
         if self.is_none:
             return network
         shift, images, points = np.append(self.origin, np.zeros(3)), [], []
@@ -286,6 +287,7 @@ class Reduction:
         return replace(network, images=tuple(images), points=tuple(points), boards=tuple(boards))
 
     def approximations(self, start: Approximations) -> Approximations:
+        """Reduce approximations."""
         if self.is_none:
             return start
         shift = np.append(self.origin, np.zeros(3))

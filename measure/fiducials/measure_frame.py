@@ -250,6 +250,7 @@ class Frame:
 
     @cached_property
     def inlier_fits(self) -> dict[int, MarkFit]:
+        """Fits of the inliers by index."""
         fits = ((index, self.detections[index].fit) for index in np.flatnonzero(self.inliers).tolist())
         return {index: fit for index, fit in fits if fit is not None}
 
@@ -424,6 +425,7 @@ def _detect(
     match, closer = replace(frame.options.match, estimate_sharpening=True), frame.placement.surroundings.robust
 
     def detection(index: int) -> Detection:
+        """Detection of one mark."""
         expected = frame.prediction(index, search_px)
         found = detect_mark(frame.scan, expected if places_px is None else expected.shift_to(places_px[index]), match)
         sure = found.false_alarms <= FAINT_MARK_BY_NOISE

@@ -227,6 +227,7 @@ def grey_or_colour(picture: NDArray[Any]) -> Samples:
 
 
 def page_radiometry(page: TiffPage, path: Path) -> Radiometry:
+    """Radiometry of a TIFF page."""
     bits, kind, samples = page.bitspersample, int(page.photometric), page.samplesperpixel
     if not isinstance(bits, int):
         raise unsupported_error(path, f"samples are of {' and '.join(map(str, bits))} bits")

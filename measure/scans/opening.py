@@ -241,6 +241,7 @@ class WindowSegments(Segments):
         """Nothing is open."""
 
     def read(self, row: int, column: int, stored: Sequence[bytes] = ()) -> Samples:
+        """Read a band of rows."""
         first = row * self.segment_height_px
         height = min(self.segment_height_px, self.height_px - first)
         return self._scan.samples(self._col0, self._row0 + first, self.width_px, height)

@@ -82,6 +82,7 @@ def whole_file(text: str) -> str:
 
 
 def part_text(file: str, page: int | None, window: Window | None) -> str:
+    """Text of a `ScanPart`."""
     parts = [f"page={page}"] if page else []
     parts += [f"window={','.join(map(str, window))}"] if window else []
     return f"{file}#{','.join(parts)}" if parts else file

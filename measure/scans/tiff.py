@@ -242,6 +242,7 @@ def _full_pictures(file: TiffFile) -> dict[int, list[TiffPage]]:
 
 
 def _pages_below(page: TiffPage) -> list[TiffPage]:
+    """SubIFDs of a page."""
     return [one.aspage() for one in page.pages] if page.subifds and page.pages is not None else []
 
 

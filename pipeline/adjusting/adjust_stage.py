@@ -152,6 +152,7 @@ def _correct_eccentricity(
 
 
 def _matching_rows(observations: Observations, some: Observations) -> list[int]:
+    """Rows of some of the observations."""
     rows = {
         mark: row
         for row, mark in enumerate(zip(observations.image, observations.point, observations.kind, strict=True))

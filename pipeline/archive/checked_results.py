@@ -71,6 +71,7 @@ class CheckRun:
 
     @cached_property
     def names(self) -> frozenset[str]:
+        """Names of all frames."""
         return frozenset(name for (name,) in self.values("name"))
 
     def pitches_um(self) -> dict[str, tuple[float, float]]:
@@ -85,6 +86,7 @@ class CheckRun:
         return {name: (width, height) for name, width, height in rows if width and height}
 
     def decisions(self) -> dict[CameraPerson, int]:
+        """Number of decisions, by camera and person."""
         counts = Counter[CameraPerson]()
         for camera, counts_json in self.values("camera, changed ->> '$.decided_by'"):
             counts.update({(camera, who): count for who, count in json.loads(counts_json or "{}").items()})

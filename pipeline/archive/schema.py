@@ -166,6 +166,7 @@ def _rows_digest(columns: str, source: str, order: str) -> str:
 
 
 def measured_marks_digest(result: str = "result", marks: str = "mark") -> str:
+    """Digest of the marks of a result."""
     return _rows_digest(MARKS, f"{marks} m where m.result = {result}.id", "number")
 
 

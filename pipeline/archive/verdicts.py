@@ -105,6 +105,7 @@ def is_answered(codes: Collection[str]) -> bool:
 
 
 def mark_verdict(kind: str, status: Status, codes: Collection[str]) -> Verdict:
+    """Verdict on one mark."""
     # Targets are many, and the adjustment tests each; a fiducial must be found, unless it lies on another part.
     if is_answered(codes):
         return Verdict.DECIDED

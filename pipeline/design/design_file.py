@@ -84,6 +84,7 @@ class Design:
 
 
 def _network(expected: Expected) -> Content:
+    """Sizes of the network."""
     network, adjustment = expected.network, expected.plan.adjustment
     return {
         "images_planned": len(network.images),

@@ -183,6 +183,7 @@ class ImageBlock:
         return {name: known.sentence(name, units.get(name, FILM_UNIT)) for name, known in lenses if known.share < 1.0}
 
     def camera_file(self, name: str) -> CameraFile:
+        """Camera file by the camera's name."""
         return next(camera for camera in self.project.cameras.values() if camera.name == name)
 
     def fiducials_mm(self, camera: str) -> dict[str, tuple[float, float]]:

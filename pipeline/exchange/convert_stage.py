@@ -80,6 +80,7 @@ class Conversion:
         return dict(zip(names, pairs, strict=True))
 
     def as_json(self) -> dict[str, object]:
+        """Content of `--json`."""
         return {
             **record_content(DistortionRecord.from_distortion(self.lens.lens.distortion, {})),
             "same": self.lens.is_same,

@@ -50,6 +50,7 @@ def library_names() -> tuple[str, ...]:
 
 
 def read_library() -> dict[str, CameraFile]:
+    """All cameras of the library, by name."""
     return {name: read_camera(library_path(name)) for name in library_names()}
 
 

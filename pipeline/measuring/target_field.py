@@ -159,6 +159,7 @@ class TargetField:
     radius: float
 
     def select(self, rows: Sequence[int]) -> "TargetField":
+        """A subset of the targets."""
         return replace(self, ids=tuple(self.ids[row] for row in rows), xyz=self.xyz[rows], sigmas=self.sigmas[rows])
 
     def predictions(self, model: ImageModel, scan: MeasuredScan, search_px: float) -> tuple[TargetPrediction, ...]:

@@ -153,6 +153,7 @@ class ReportData:
 
     @cached_property
     def residuals_by_image(self) -> Mapping[str, list[ResidualRecord]]:
+        """Residuals of the adjustment by image."""
         rows: dict[str, list[ResidualRecord]] = defaultdict(list)
         for row in self.adjustment.residuals if self.adjustment else ():
             rows[row.image].append(row)
@@ -198,6 +199,7 @@ class Mark:
 
     @property
     def codes(self) -> tuple[Code, ...]:
+        """Codes of its reason."""
         return self.reason.codes
 
     @property

@@ -130,6 +130,7 @@ def term_rows(terms: Mapping[str, Quantity]) -> Iterator[ParameterRow]:
 
 
 def _convert_unit(known: Quantity, factor: float) -> Quantity:
+    """Convert a quantity to another unit."""
     given = known.given and GivenQuantity(factor * known.given.value, factor * known.given.sigma)
     return replace(known, value=factor * known.value, sigma=factor * known.sigma, given=given)
 

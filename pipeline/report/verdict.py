@@ -302,6 +302,7 @@ def _corners_notes(check: Check) -> Iterator[str]:
 
 
 def _solution(data: ReportData) -> AdjustmentRecord | None:
+    """The adjustment, if it has a solution."""
     return data.adjustment if data.adjustment and not any(_no_solution(data.adjustment)) else None
 
 

@@ -479,6 +479,7 @@ def _smoothing_px(chain: frame_canvas.FrameChain, canvas: frame_canvas.Canvas) -
 
 
 def resampled_json(results: Sequence[Resampled]) -> list[dict[str, object]]:
+    """The results for `--json`."""
     return [asdict(result) | {"path": result.path and str(result.path)} for result in results]
 
 

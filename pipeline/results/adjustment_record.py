@@ -89,6 +89,7 @@ class DistortionRecord(WithRest):
 
     @classmethod
     def from_distortion(cls, distortion: Distortion, parameters: Mapping[str, Quantity]) -> "DistortionRecord":
+        """Record of a distortion with the estimates of its parameters."""
         model = family(distortion.family)
         return cls(
             family=distortion.family,

@@ -174,6 +174,7 @@ def mark_row(mark: MarkMeasurement) -> tuple[object, ...]:
 
 
 def _read_mark(row: Sequence[Any]) -> MarkMeasurement:
+    """Read a mark from a row of MARK_COLUMNS."""
     point, kind, col, row_px, _, _, _, causes, status, code, reason, quality = row
     parts = json.loads(causes)["of"] if causes else None
     return MarkMeasurement(

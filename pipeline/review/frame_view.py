@@ -160,6 +160,7 @@ class ReviewFrame:
 
 
 def mark_json(mark: MarkMeasurement) -> Json:
+    """JSON common to all marks."""
     return {
         "point": mark.point,
         "kind": mark.kind,
