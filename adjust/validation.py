@@ -275,6 +275,12 @@ def _extent_faults(network: Network) -> Faults:
             )
 
 
+def largest_sigma_mm(network: Network) -> float:
+    """Largest standard deviation that may be added to those of marks: `_sigma_faults` accepts little more in all."""
+    by_image = np.array([network.extent_by_image[image.name].half_mm for image in network.images])
+    return 0.99 * LARGEST_SIGMA / float(np.median(1.0 / by_image[network.image_numbers]))
+
+
 def _sigma_faults(network: Network) -> Faults:
     """Standard deviations of most marks that are a large part of the images, or none: another unit."""
     sigma_mm = np.sqrt(np.trace(network.observations.covariance_mm2, axis1=1, axis2=2) / 2.0)

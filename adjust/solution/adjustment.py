@@ -33,7 +33,7 @@ from adjust.solution.options import Datum, Method, Options
 from adjust.solution.plausibility import check_plausibility
 from adjust.solution.result import Adjustment, adjust_problem
 from adjust.solution.wrong_names import exchanged_fiducials, misnumbered_images
-from adjust.validation import validate
+from adjust.validation import largest_sigma_mm, validate
 
 __all__ = ["Datum", "Method", "Options", "adjust", "adjust_unmodelled"]
 
@@ -165,9 +165,10 @@ def _drop_contradicting(
 
 def _fit_unmodelled(network: Network, options: Options) -> Adjustment:
     """Adjust a network with standard deviations of unmodelled errors by camera with which v'Pv of its marks equals
-    their redundancy."""
+    their redundancy, but none larger than an adjustment accepts: the lens may not suit at all."""
     sigma_mm = {each.name: FIRST * float(np.hypot(*each.frame_mm)) for each in network.cameras}
     result = adjust(_add_unmodelled(network, sigma_mm), options=options)
+    largest_mm = largest_sigma_mm(result.network)
     for _ in range(ROUNDS):
         if not result.converged:
             break
@@ -179,7 +180,7 @@ def _fit_unmodelled(network: Network, options: Options) -> Adjustment:
             redundancy = float(residuals.redundancy[rows].sum())
             squares, given = residuals.v_mm[rows] ** 2, variances[rows] - before**2
             added = added_variance(squares, given, redundancy) if redundancy >= 1.0 else None
-            sigma_mm[camera] = float(np.sqrt(added or 0.0))
+            sigma_mm[camera] = min(float(np.sqrt(added or 0.0)), largest_mm)
         if all(abs(sigma_mm[each] - before_mm[each]) <= SETTLED * sigma_mm[each] for each in sigma_mm):
             break
         result = adjust(_add_unmodelled(network, sigma_mm), result.start, options)

@@ -200,11 +200,13 @@ def find_chessboard(picture: Bytes, spec: ChessboardSpec, is_quick: bool = False
 
 def _part_of_chessboard(picture: Bytes, pattern: WholePattern, spec: ChessboardSpec) -> FoundBoard:
     """Name the corners of a partly covered or cropped board, if its visible ends and the colours of its squares leave
-    one position on the board, up to a turn that maps the board onto itself."""
+    one position on the board, up to a turn that maps the board onto itself. A pattern of the board's count that ends on
+    all sides needs no border."""
     borders = tuple(
         ended and _has_border(picture, np.rot90(pattern.grid, side)) for side, ended in enumerate(pattern.has_ended)
     )
-    has_borders = (borders[0] or borders[2]) and (borders[1] or borders[3])
+    is_whole = pattern.is_bounded and pattern.grid.shape[:2] in ((spec.rows, spec.columns), (spec.columns, spec.rows))
+    has_borders = is_whole or ((borders[0] or borders[2]) and (borders[1] or borders[3]))
     namings = list(_namings(picture, pattern.grid, borders, spec)) if has_borders else []
     if not namings or any(not _are_alike(namings[0], naming, spec) for naming in namings):
         return FoundBoard({}, Reason(_refusal(spec, pattern), Code.NO_BOARD))

@@ -18,7 +18,7 @@ from adjust.display import CameraPlots, PlottedResult, data_frame
 from adjust.errors import AdjustmentError
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
-from adjust.validation import LARGEST_SIGMA
+from adjust.validation import largest_sigma_mm
 from measure import MeasurementError, open_scan
 from measure.boards.find import fitting_board, recognise_board
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
@@ -276,9 +276,7 @@ def _chosen_lens(
     observations = first.network.observations
     variance = float(np.median(np.trace(observations.covariance_mm2, axis1=1, axis2=2)) / 2.0)
     variance += (GENEROUS**2 - 1.0) * first.unmodelled_mm[camera.name] ** 2
-    extents = first.network.extent_by_image
-    per_mm = float(np.median([1.0 / extents[image].half_mm for image in observations.image]))
-    variance = min(variance, (0.99 * LARGEST_SIGMA / per_mm) ** 2)
+    variance = min(variance, largest_sigma_mm(first.network) ** 2)
     covariance = np.broadcast_to(variance * np.eye(2), observations.covariance_mm2.shape).copy()
     alike = replace(first.network, observations=replace(observations, covariance_mm2=covariance))
     adjusted = partial(adjust, options=adjustment_options(project.adjust))

@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
 from measure import Status, open_scan
-from measure.boards import specs
+from measure.boards import find, specs
 from measure.boards.edge_curvature import edge_curvatures
 from measure.boards.find import is_even, recognise_board, whole_pattern
 from measure.boards.markers import ReadMarkers, charuco_board, find_aruco, find_charuco, off_corners
@@ -259,6 +259,22 @@ def test_a_part_that_may_be_another_is_refused(large_board: tuple[Array, dict[st
     board = measure_board(draw.make_scan(large_board[0][shown]), LARGE)
     assert not any(mark.status.is_observation for mark in board.marks)
     assert "nothing shows which part it is" in board.reason
+
+
+def test_all_corners_without_a_light_border_are_a_whole_board(
+    large_board: tuple[Array, dict[str, Array]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a board with a narrow border, or in a fisheye, OpenCV finds a part; the pattern grows to the board's count."""
+    picture, truth = large_board[0].copy(), large_board[1]
+    corners = np.array(list(truth.values())).reshape(6, 9, 2)
+    outline = np.concatenate([corners[0, :1], corners[0, -1:], corners[-1, -1:], corners[-1, :1]])
+    inside = cv2.fillConvexPoly(np.zeros(picture.shape, np.uint8), np.round(outline).astype(np.int32), 1)
+    inside = cv2.dilate(inside, np.ones((17, 17), np.uint8)) > 0
+    picture[~inside] = picture.min()
+    monkeypatch.setattr(find, "_grids", lambda *_: iter([(corners[1:5, 1:6], np.inf)]))
+    board = measure_board(draw.make_scan(picture), LARGE)
+    assert sum(mark.status.is_observation for mark in board.marks) > 50
+    assert np.abs(draw.errors_px(board, truth)).max() < 0.05
 
 
 def test_a_board_with_corners_outside_is_refused_in_fitting_words(large_board: tuple[Array, dict[str, Array]]) -> None:

@@ -416,7 +416,9 @@ def test_a_scan_stored_twice_is_none_rectified_alike(has_target: bool) -> None:
     assert not any(each.frame.problems for each in check_repeated_views(apart, False, lambda scan: drawn))
 
 
-def simulated_marks(folder: Path, odd: tuple[str, ...] = ()) -> tuple[Project, list[ComparatorPoint]]:
+def simulated_marks(
+    folder: Path, odd: tuple[str, ...] = (), noise_px: float = 0.02
+) -> tuple[Project, list[ComparatorPoint]]:
     """A project of pictures of a board, and marks of it; the squares of the odd pictures are 4 % wider."""
     options = CalibrationOptions(board_options("chessboard", "7x5", "20mm"))
     images = tuple(f"p{number}" for number in range(len(TURNS)))
@@ -429,7 +431,7 @@ def simulated_marks(folder: Path, odd: tuple[str, ...] = ()) -> tuple[Project, l
         rotation, shift = pose(number)
         shown = POINTS * (1.04 if image in odd else 1.0, 1.0, 1.0)
         places = cv2.projectPoints(shown, cv2.Rodrigues(rotation)[0], shift, MATRIX, np.zeros(5))[0].reshape(-1, 2)
-        for point, place in zip(BOARD.object_points(), places + rng.normal(0.0, 0.02, places.shape), strict=True):
+        for point, place in zip(BOARD.object_points(), places + rng.normal(0.0, noise_px, places.shape), strict=True):
             xy_mm, sigma_mm = place * [options.pixel_mm, -options.pixel_mm], np.full(2, 0.02 * options.pixel_mm)
             marks.append(ComparatorPoint(image, point, "target", xy_mm, sigma_mm, 0.0, Status.MEASURED, ""))
     return write_project(folder, files, options, {"camera": "opencv4"}), marks
@@ -444,8 +446,17 @@ def test_a_picture_of_another_print_is_named_and_no_other(odd: tuple[str, ...], 
     assert all("another print of the board" in why for why in found.values())
 
 
+def test_a_lens_that_does_not_suit_at_all_is_adjusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its errors of more than 2 % of the marks' extent were refused as a wrong unit, before a fisheye was tried."""
+    monkeypatch.setattr("adjust.solution.adjustment._drop_contradicting", lambda network, first, *_: first)
+    project, marks = simulated_marks(tmp_path, noise_px=8.0)
+    found = adjust_marks(project, [mark for mark in marks if mark.image < "p4"])
+    assert found.converged
+    assert any("px are not modelled" in remark for remark in found.remarks)
+
+
 def test_a_picture_of_three_corners_does_not_spoil_the_others(tmp_path: Path) -> None:
-    """No orientation brings these three to where they were found, which refused all pictures."""
+    """Three points leave several orientations, or none: one picture of a real folder refused all others."""
     project, marks = simulated_marks(tmp_path)
     others, own = [mark for mark in marks if mark.image != "p3"], [mark for mark in marks if mark.image == "p3"]
     wrong = [replace(mark, point=point) for mark, point in zip(own, ("r0c0", "r0c6", "r4c0"), strict=False)]
