@@ -41,6 +41,7 @@ _SAMPLED = slice(None, None, 3)  # subsampling for that estimate, since neighbou
 _MOST_CACHED = 768 << 20  # bytes, enough for four different marks in a large scan
 _SMALL_MAPS = 32  # maps of a small scan at full resolution
 _LEAST_CACHED = 32 << 20  # bytes
+_STEP = 1 / 32767  # NCC, of dilated maps: at 16 bits they take half the memory
 _ROUNDING = 1e-9  # of the elements of a turn by a quarter
 _AT_ONCE = 1000  # places whose neighbourhoods are held in memory at a time
 
@@ -195,15 +196,15 @@ class CorrelationMaps(Mapping[Key, Map]):
 
     def __init__(
         self,
-        channels: Sequence[Map],
+        channels: Sequence[Callable[[], Map]],
         templates: Templates,
         signs: Collection[int],
         surroundings: Surroundings,
         faint_dn: float,
         cache: ByteCache,
     ) -> None:
-        """channels: images that exceed the maps by the templates' half_px; faint_dn: contrast at the level of
-        rounding."""
+        """channels: functions that make images which exceed the maps by the templates' half_px; faint_dn: contrast at
+        the level of rounding."""
         self._channels, self._templates, self._signs, self._cache = channels, templates, tuple(signs), cache
         self._surroundings, self._faint_dn = surroundings, faint_dn
         self._own = object()  # identifies these maps in the cache; self would create a reference cycle
@@ -222,15 +223,15 @@ class CorrelationMaps(Mapping[Key, Map]):
     def _extremes(self, kind: int) -> Map:
         """(1 or 2, rows, columns) largest and least correlation of a kind over all channels; of one channel both are
         the same."""
-        image, detail, get = self._templates.images[kind], self._templates.details_px[kind], self._cache.get
+        image, detail = self._templates.images[kind], self._templates.details_px[kind]
         margin = self._templates.half_px - len(image) // 2
         extremes = None
         for number, channel in enumerate(self._channels):
             # Kinds of equal detail share the flattened image, kinds with equal masks its variation under them.
             key = self._own, number, detail
-            flat = get(key, partial(self._surroundings.flatten, channel, detail, self._faint_dn))
+            flat = self._shared(key, partial(self._flatten, channel, detail))
             chip, mask = self._surroundings.pattern(image, detail, flat)
-            varied = get((key, mask.tobytes()), partial(variation, flat, mask))
+            varied = self._shared((key, mask.tobytes()), partial(variation, flat, mask))
             response = correlation(flat, chip, mask, varied)
             rows, cols = (slice(margin, side - margin) for side in response.shape)
             own = response[rows, cols]
@@ -241,18 +242,26 @@ class CorrelationMaps(Mapping[Key, Map]):
         assert extremes is not None
         return extremes
 
+    def _flatten(self, channel: Callable[[], Map], detail_px: float) -> Map:
+        return self._surroundings.flatten(channel(), detail_px, self._faint_dn)
+
+    def _shared(self, key: Hashable, make: Callable[[], Map]) -> Map:
+        """Value that several kinds share; a single kind needs it once."""
+        return self._cache.get(key, make) if len(self._templates.images) > 1 else make()
+
 
 class Dilation:
-    """Correlation map dilated by a disk. area_px: of the disk; background: 95th percentile beside the marks, at least
-    0."""
+    """Correlation map dilated by a disk, in steps of 1 / 32767. area_px: of the disk; background: 95th percentile
+    beside the marks, at least 0."""
 
     def __init__(self, map_: Map, origin: NDArray[np.int_], radius_px: float, marks: int) -> None:
         size = 2 * round(radius_px) + 1
         disk = np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)), np.uint8)
-        self.map, self.origin, self.area_px = np.asarray(cv2.dilate(map_, disk)), origin, int(disk.sum())
+        steps = cv2.addWeighted(map_, 1 / _STEP, map_, 0.0, 0.0, dtype=cv2.CV_16S)
+        self.map, self.origin, self.area_px = np.asarray(cv2.dilate(steps, disk)), origin, int(disk.sum())
         # The disks about the marks of a dense lattice cover a tenth of the scan: they would be the background.
         percent = _BACKGROUND_PERCENT * max(1 - marks * self.area_px / map_.size, _LEAST_BACKGROUND)
-        self.background = max(float(np.percentile(self.map[_SAMPLED, _SAMPLED], percent)), 0.0)
+        self.background = max(_STEP * float(np.percentile(self.map[_SAMPLED, _SAMPLED], percent)), 0.0)
 
     @property
     def nbytes(self) -> int:
@@ -260,12 +269,11 @@ class Dilation:
 
     def share(self, place: Array) -> float:
         """Fraction of all places whose response is at least that of a place (2,) of the reduced scan."""
-        return np.count_nonzero(self.map >= self.height(place)) / self.map.size
+        return np.count_nonzero(self.map >= self._steps(place)) / self.map.size
 
     def height(self, place: Array) -> float:
         """Highest response within the radius of a place (2,) of the reduced scan."""
-        col, row = np.clip(np.rint(place).astype(int) - self.origin, 0, np.array(self.map.shape[::-1]) - 1)
-        return float(self.map[row, col])
+        return _STEP * float(self._steps(place))
 
     def strength(self, places: NDArray[np.int_]) -> tuple[Array, Mask]:
         """(...) squared responses in excess of the background at places (..., 2) of the reduced scan, and mask of those
@@ -273,8 +281,13 @@ class Dilation:
         rows, cols = self.map.shape
         col, row = np.moveaxis(places - self.origin, -1, 0)
         inside = (col >= 0) & (row >= 0) & (col < cols) & (row < rows)
-        response = np.where(inside, self.map[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)], 0.0).astype(float)
-        return np.maximum(np.maximum(response, 0.0) ** 2 - self.background**2, 0.0), inside
+        steps = self.map[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)]
+        response = np.where(inside, _STEP * np.maximum(steps, 0), 0.0)
+        return np.maximum(response**2 - self.background**2, 0.0), inside
+
+    def _steps(self, place: Array) -> np.int16:
+        col, row = np.clip(np.rint(place).astype(int) - self.origin, 0, np.array(self.map.shape[::-1]) - 1)
+        return np.int16(self.map[row, col])
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,8 +364,12 @@ def correlate_scan(
     """
     templates = Templates.render(scan, views, half_px)
     half = (templates.half_px,) * 4
-    reduced = (scan.reduced(templates.reduction, weights) for weights in _channels(scan))
-    channels = [np.asarray(cv2.copyMakeBorder(grey, *half, cv2.BORDER_REPLICATE), np.float32) for grey in reduced]
+
+    def bordered(weights: Sequence[float]) -> Map:
+        grey = scan.reduced(templates.reduction, weights)
+        return np.asarray(cv2.copyMakeBorder(grey, *half, cv2.BORDER_REPLICATE), np.float32)
+
+    channels = [partial(bordered, weights) for weights in _channels(scan)]
     maps = CorrelationMaps(channels, templates, signs, surroundings, scan.full_scale_dn * FAINT, cache)
     return Responses(maps, templates.kinds, templates.reduction, cache, None, surroundings, marks)
 
@@ -383,7 +400,8 @@ def correlate_windows(
 
     def window_maps(corner: int) -> dict[Key, Map]:
         col0, row0 = (origins[corner] - half).tolist()
-        channels = [scan.reduced_window(reduction, col0, row0, size, size, weights) for weights in _channels(scan)]
+        window = reduction, col0, row0, size, size
+        channels = [partial(scan.reduced_window, *window, weights) for weights in _channels(scan)]
         own_cache = ByteCache(_MOST_CACHED)
         maps = CorrelationMaps(channels, templates, signs, WIDE, scan.full_scale_dn * FAINT, own_cache)
         own = (pair for pair in kinds if pair[0] == corner)

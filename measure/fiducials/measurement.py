@@ -5,6 +5,7 @@ The result has a row for each mark, found or not, and the problems of the frame.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -19,8 +20,8 @@ from measure.fiducials.mark_fit import Detection
 from measure.fiducials.measure_frame import Frame, detect_some, measure_frame, orient_frame, rename_frame
 from measure.fiducials.options import CLICK_SIGMA_PX, Click, FiducialOptions
 from measure.fiducials.scan_orientation import decide_scan_orientation
-from measure.fiducials.search import SearchResult
-from measure.fiducials.stages import doubt_frame, false_placements, find_frame, find_in_negative
+from measure.fiducials.search import SearchResult, false_placements
+from measure.fiducials.stages import doubt_frame, find_frame, find_in_negative
 from measure.flags import MAX_FALSE_FRAMES, NO_REASON, Cause, Code, Reason, Status
 from measure.geometry import UP_FROM_CAMERA
 from measure.marks.shapes import (
@@ -330,19 +331,40 @@ def absent_frame(
     )
     if Code.NO_FIT in reason.codes:
         remedy = "compare the drawings of these marks with the scan, or set tone under [measure] in the project"
-    coarse, finest_um = NO_REASON, 1000 * min(finest_detail_mm(mark.mark) for mark in layout.marks)
-    filling_um = 1000 * max(layout.frame_mm) / max(scan.width_px, scan.height_px)
-    pixel_um, source = (max(pitch_um), "") if pitch_um else (filling_um, ", as if the frame filled the scan,")
-    if finest_um < _PLAIN_PX * pixel_um:
+    coarse, own = NO_REASON, coarseness(layout, (scan.width_px, scan.height_px), pitch_um)
+    if own.is_too_coarse:
+        source = "" if pitch_um else ", as if the frame filled the scan,"
         coarse = Reason(
-            f"The scan may be too coarse: at {pixel_um:.0f} µm a pixel{source} the finest detail of the marks, "
-            f"{finest_um:.0f} µm, is {finest_um / pixel_um:.1f} px wide. "
-            f"Scan at {finest_um / _PLAIN_PX:.0f} µm or finer.",
+            f"The scan may be too coarse: at {own.pixel_um:.0f} µm a pixel{source} the finest detail of the marks, "
+            f"{own.finest_um:.0f} µm, is {own.finest_um / own.pixel_um:.1f} px wide. "
+            f"Scan at {own.needed_um:.0f} µm or finer.",
             Code.SMALL,
         )
     remedy += f". {coarse}" if coarse else "."
     problem = Reason(f"no fiducial was measured: {reason}; {remedy}", Code.NO_FRAME, *coarse.codes)
     return FrameMeasurement(scan.name, marks, None, None, (problem,))
+
+
+class Coarseness(NamedTuple):
+    """Finest detail of the marks of a camera beside a pixel of a scan, µm."""
+
+    finest_um: float
+    pixel_um: float
+
+    @property
+    def needed_um(self) -> float:
+        """Largest pixel pitch at which the marks are plain."""
+        return self.finest_um / _PLAIN_PX
+
+    @property
+    def is_too_coarse(self) -> bool:
+        return self.pixel_um > self.needed_um
+
+
+def coarseness(layout: FiducialLayout, size_px: tuple[int, int], pitch_um: tuple[float, float] | None) -> Coarseness:
+    """Compare the finest detail of the marks with the pixels of a scan, at its pitch or as if the frame filled it."""
+    finest_um = 1000 * min(finest_detail_mm(mark.mark) for mark in layout.marks)
+    return Coarseness(finest_um, max(pitch_um) if pitch_um else 1000 * max(layout.frame_mm) / max(size_px))
 
 
 def _absent_marks(layout: FiducialLayout, reason: Reason) -> tuple[MarkMeasurement, ...]:

@@ -7,11 +7,13 @@ from operator import attrgetter
 
 import numpy as np
 
+from measure.array_types import Array
 from measure.detection.correlation import WIDE, Surroundings
 from measure.detection.responses import MarkView, Responses, SearchEffort, correlate_scan, correlate_windows
+from measure.detection.significance import chance_of_marks
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, lattice_steps_mm, mark_sign
 from measure.fiducials.options import FiducialOptions
-from measure.geometry import POSES, UP_FROM_CAMERA
+from measure.geometry import POSES, UP_FROM_CAMERA, reduced_px
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
 
@@ -20,6 +22,7 @@ Pair = tuple[float, float]
 _PITCH_STRETCHES = (-0.015, 0.015, -0.03, 0.03)  # relative: an office scanner's carriage may be some per cent too fast
 _SCALE_STEPS = (1.1, 1.0, 0.91, 0.83, 0.75)  # of the largest scale at which the frame fits into the scan
 _STEP_TOLERANCE = 0.06  # relative tolerance of each scale step: it reaches the next step
+_FOUND_TOLERANCE = 0.02  # relative, of a pitch found in a reduced scan
 _LARGE_PX = 1 << 24  # px in a large scan; smaller ones are read whole in a short time
 _REACH = 0.025  # fraction of the frame's side: film laid by hand is off by some millimetres and a degree
 _LARGEST_SHARE = 0.25  # fraction of the scan: above it the whole scan is searched, for the additional evidence
@@ -73,6 +76,13 @@ def pitch_hypotheses(
         return as_given
     fills = any(abs(pair[0] / each.mm[0] - 1) < _STEP_TOLERANCE for each in filling)
     return [*as_given, filling] if fills else [*as_given, filling, filling_longer]
+
+
+def at_pitch(hypotheses: Hypotheses, pitch_mm: float) -> Hypotheses:
+    """Hypotheses with the pixels' stretches of these, at a pitch that a search of a reduced scan found."""
+    square = PitchHypothesis((pitch_mm, pitch_mm), _FOUND_TOLERANCE, (pitch_mm, pitch_mm))
+    ratios = dict.fromkeys(tuple(np.round(np.divide(each.mm, each.drawn_mm), 9).tolist()) for each in hypotheses)
+    return [replace(square, mm=(pitch_mm * x, pitch_mm * y)) for x, y in ratios]
 
 
 def longer(given: PitchHypothesis, stretch: float) -> PitchHypothesis:
@@ -235,3 +245,40 @@ class FrameSearch:
             within = [bool((np.abs(middle_mm) < frame_mm / 2).all()) for middle_mm in middles_mm]
             found = list(compress(found, within))
         return SearchResult(tuple(found), searches, size_px)
+
+
+def false_placements(result: SearchResult, placement: Placement) -> float:
+    """Expected number of placements as good in a similar scan without any frame, under this pitch hypothesis alone."""
+    search = result.searches[placement.pitch_mm]
+    places = placement.places_px(search.camera_mm)
+    inside = np.all((places >= 0) & (places < result.size_px), axis=1)
+    found = {index: places[index] for index in np.flatnonzero(inside).tolist()}
+    return false_alarms(result, placement, found, len(found), search.tolerance_px)
+
+
+def false_alarms(
+    result: SearchResult, placement: Placement, found_px: Mapping[int, Array], inside: int, tolerance_px: float
+) -> float:
+    """Expected number of false frames, from the shares of places that respond as strongly within tolerance_px.
+
+    The weakest mark found responds as strongly as a share of all places. The number of distinct frames is that of all
+    pairs of places, for two marks far apart, that the bounds of rotation and scale allow.
+    """
+    search = result.searches[placement.pitch_mm]
+    responses, shares, same_px = search.responses, [], 1
+    for index, place in found_px.items():
+        dilation = responses.dilated(search.key(placement, index), tolerance_px)
+        shares.append(dilation.share(reduced_px(place, responses.reduction)))
+        same_px = dilation.area_px
+    counts = np.arange(max(min(3, inside), 1), len(shares) + 1)
+    if len(counts) == 0:
+        return np.inf
+    likely = chance_of_marks(counts, inside, np.sort(shares)[counts - 1])
+    # Number of distinct frames: same_px neighbouring places of the reduced scan have the same dilated response.
+    extent_mm = float(np.hypot(*np.ptp(search.camera_mm, axis=0)))
+    span_px = extent_mm / float(search.pitch.mean()) / responses.reduction
+    places = next(iter(responses.maps.values())).size
+    second = 2 * search.bounds.rotation_rad * 2 * search.bounds.scale_tolerance * span_px**2
+    polarities = len({sign for _, sign in responses.maps})
+    different = places / same_px * second / same_px * len(search.distinct) * polarities
+    return float(len(counts) * likely.min() * different)

@@ -20,6 +20,7 @@ import numpy as np
 from measure.array_types import Array
 from measure.detection.correlation import CLOSE, GRAINY, WIDE, Surroundings
 from measure.detection.significance import chance_of_marks, share_of_places
+from measure.fiducials.camera_recognition import find_pitch_mm
 from measure.fiducials.constellation import FREE_MARKS, NARROW, Placement, distinct_places
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA
 from measure.fiducials.measure_frame import (
@@ -37,7 +38,11 @@ from measure.fiducials.scan_orientation import decide_scan_orientation
 from measure.fiducials.search import (
     FrameSearch,
     Hypotheses,
+    Pair,
     SearchResult,
+    at_pitch,
+    false_alarms,
+    false_placements,
     is_searched_by_windows,
     longer,
     pitch_hypotheses,
@@ -62,6 +67,7 @@ from measure.tone.curve import Tone
 Kind = Literal["middle", "given", "oblique", "pitch", "faint"]
 Evaluated = tuple[float, Frame]  # expected number of false frames as good
 
+_MOST = 0.6  # fraction of a lattice's marks: at half its spacing up to 0.56 of them lie on others
 _TRIALS = 4  # placements tried at full resolution after the best one
 _NOTHING = Reason("no two of the camera's marks were found in the scan", Code.NO_FRAME)
 _LEAST_GAINED = 2  # marks: the two additional parameters of a perspective may fit one wherever it lies
@@ -105,9 +111,20 @@ class Stage:
         """Whether its result replaces an earlier one, taken or not."""
         return self.kind in ("middle", "given")
 
+    @property
+    def asks_pitch(self) -> bool:
+        """Whether its hypotheses are to tell the pitch."""
+        return len({each.drawn_mm for each in self.hypotheses}) > 1
+
+    def allows_pitch(self, pitch_mm: Pair) -> bool:
+        """Whether a pitch lies within the tolerance of one of its hypotheses."""
+        return any(np.abs(np.divide(pitch_mm, each.mm) - 1).max() <= each.tolerance for each in self.hypotheses)
+
     def is_unnecessary(self, found: "StageResult") -> bool:
         """Whether the earlier results make it unnecessary."""
         frame = found.frame if found.is_taken else None
+        if frame and (self.is_given or self.at_given) and not self.allows_pitch(frame.placement.pitch_mm):
+            return True
         if self.tone is not None:
             # Another curve may cure fits that failed, and marks in their places that are unlike their drawings.
             return found.is_taken or found.frame is None or not (found.frame.failed_fits or found.frame.agrees)
@@ -202,21 +219,56 @@ def find_in_negative(
     return found if found.is_taken and not found.doubt else None
 
 
+class _StageSearch:
+    """Search of the stages in one scan."""
+
+    def __init__(self, scan: Scan, layout: FiducialLayout, options: FiducialOptions) -> None:
+        self._scan, self._layout, self._search = scan, layout, FrameSearch(scan, layout, options)
+
+    @cached_property
+    def _shown_mm(self) -> float | None:
+        """Pitch that a thumbnail of the scan shows."""
+        return find_pitch_mm(self._scan, self._layout)
+
+    def placements(self, stage: Stage) -> SearchResult:
+        """Find placements under the stage's hypotheses; if they are to tell the pitch, at the one that a thumbnail
+        shows."""
+        if stage.kind == "middle":
+            return self._search.search_middle(stage.options, stage.hypotheses)
+        hypotheses = at_pitch(stage.hypotheses, self._shown_mm) if stage.asks_pitch and self._shown_mm else None
+        return self._search.search_scan(stage.options, hypotheses or stage.hypotheses, stage.surroundings)
+
+    def contradicts(self, stage: Stage, result: SearchResult) -> bool:
+        """Whether a given pitch has no significant placement of most marks, and a thumbnail shows another pitch.
+
+        At a multiple of its pitch some marks of a lattice still lie on others.
+        """
+        most = [each for each in result.placements[:1] if each.supported >= _MOST * len(self._layout.marks)]
+        if any(false_placements(result, each) <= MAX_FALSE_FRAMES for each in most):
+            return False
+        return self._shown_mm is not None and not stage.allows_pitch((self._shown_mm, self._shown_mm))
+
+
 def _find_in_stages(
     scan: Scan, layout: FiducialLayout, stages: Sequence[Stage], options: FiducialOptions
 ) -> StageResult:
-    search, result = FrameSearch(scan, layout, options), SearchResult()
+    search, result, at_given = _StageSearch(scan, layout, options), SearchResult(), SearchResult()
     found, hypotheses_so_far, hypotheses_at_given_pitch = StageResult(), 0, 0
-    for stage in stages:
+    pending = list(stages)
+    while pending:
+        stage = pending.pop(0)
         if stage.is_unnecessary(found):
             continue
+        result = at_given if stage.tone else search.placements(stage)
+        if stage.kind == "given" and stage.tone is None:
+            others = [each for each in pending if each.kind == "pitch" and each.asks_pitch]
+            if others and search.contradicts(stage, result):
+                pending = [*others, stage, *(each for each in pending if each not in others)]
+                continue
         if stage.tone is None:
+            at_given = result if stage.is_given else at_given
             hypotheses_so_far += len(stage.hypotheses)
             hypotheses_at_given_pitch += len(stage.hypotheses) if stage.is_given or stage.at_given else 0
-            if stage.kind == "middle":
-                result = search.search_middle(stage.options, stage.hypotheses)
-            else:
-                result = search.search_scan(stage.options, stage.hypotheses, stage.surroundings)
         tried = hypotheses_at_given_pitch if stage.at_given else hypotheses_so_far
         start = scan if stage.tone is None else scan.replace_tone(stage.tone)
         frames = measure_stage(start, layout, stage, result, tried)
@@ -235,7 +287,7 @@ def _find_in_stages(
                 misfit = explain_misfit(frame) if frame else _NOTHING
                 found = replace(found, result=result, frame=frame, is_taken=False, misfit=misfit)
         else:
-            share = hypotheses_at_given_pitch / tried
+            share = max(hypotheses_at_given_pitch, 1) / tried
             # Those that would be accepted if their pitch were given.
             likely = [each for each in frames if each[1].accepted or each[0] * share <= MAX_FALSE_FRAMES]
             likely = [] if stage.at_given else likely
@@ -256,20 +308,24 @@ def measure_stage(
     An accepted frame of the prior belief needs no such test. A perspective has to fit nearly all marks, and only
     unblemished ones count. Under another pitch, and of faint marks, the significance of the frame decides: its marks
     need not be clear, only agree. `tried`, the number of hypotheses so far, limits which placements are measured.
-    Placements under another tone curve or pitch are measured only if some marks are clear there.
+    Placements under another tone curve or pitch that are not significant themselves are measured only if some marks
+    are clear there.
     """
     kind, options, found = stage.kind, stage.options, result.placements
     begun = dict[Placement, Frame]()
     # The best placement, then others elsewhere by score times supporting marks: a few high peaks alone are often false.
     others = [] if kind == "middle" else sorted(found[1:], key=lambda each: -each.score * each.supported)
     places = distinct_places((*found[:1], *others), _TRIALS + 1)
+    significant = list[Placement]()
     if kind in ("pitch", "faint"):
         number = tried if kind == "faint" else len(stage.hypotheses)
-        places = [each for each in places if number * false_placements(result, each) <= MAX_FALSE_PLACEMENTS]
+        expected = {each: number * false_placements(result, each) for each in places}
+        places = [each for each in places if expected[each] <= MAX_FALSE_PLACEMENTS]
+        significant = [each for each in places if expected[each] <= MAX_FALSE_FRAMES]
     if kind == "pitch" or stage.tone is not None:
-        every = range(len(layout.marks))
-        begun = {each: frame for each in places if (frame := detect_some(scan, layout, each, options, every))}
-        places = list(begun)
+        every, unsure = range(len(layout.marks)), [each for each in places if each not in significant]
+        begun = {each: frame for each in unsure if (frame := detect_some(scan, layout, each, options, every))}
+        places = [each for each in places if each in significant or each in begun]
     if kind == "oblique":
         needed = max(_OBLIQUE, len(layout.marks) - _MISSED)
         places = [each for each in places if each.supported >= needed - _MISSED]
@@ -371,15 +427,6 @@ def _what_to_do(found: StageResult) -> str:
     )
 
 
-def false_placements(result: SearchResult, placement: Placement) -> float:
-    """Expected number of placements as good in a similar scan without any frame, under this pitch hypothesis alone."""
-    search = result.searches[placement.pitch_mm]
-    places = placement.places_px(search.camera_mm)
-    inside = np.all((places >= 0) & (places < result.size_px), axis=1)
-    found = {index: places[index] for index in np.flatnonzero(inside).tolist()}
-    return _false_alarms(result, placement, found, len(found), search.tolerance_px)
-
-
 def false_frames(result: SearchResult, frame: Frame, indices: Iterable[int]) -> float:
     """Expected number of false frames as good in the scan as one with marks, by index, found where they were fitted.
 
@@ -392,7 +439,7 @@ def false_frames(result: SearchResult, frame: Frame, indices: Iterable[int]) -> 
     for stretches in (np.zeros(1), _STRETCHES):
         misfit_px = _misfit_px(frame, found_px, stretches)
         tolerance_px = min(max(misfit_px, NARROW * widest_px), widest_px)
-        expected.append(len(stretches) * _false_alarms(result, placement, found_px, frame.inside_count, tolerance_px))
+        expected.append(len(stretches) * false_alarms(result, placement, found_px, frame.inside_count, tolerance_px))
     at_reduced = _CRITERIA * min(expected)
     if placement.reduction == 1 or not _RARE_FRAMES < at_reduced < _FREQUENT_FRAMES:
         return at_reduced
@@ -431,34 +478,6 @@ def _misfit_px(frame: Frame, found_px: Mapping[int, Array], stretches: Array) ->
     scales, shifts = fit_similarity(places, found_mm, np.ones(len(found)))
     off = np.abs(found_mm - scales[:, None] * places - shifts[:, None]).max(axis=1)
     return float(off.min() / pitch.mean() / placement.reduction)
-
-
-def _false_alarms(
-    result: SearchResult, placement: Placement, found_px: Mapping[int, Array], inside: int, tolerance_px: float
-) -> float:
-    """Expected number of false frames, from the shares of places that respond as strongly within tolerance_px.
-
-    The weakest mark found responds as strongly as a share of all places. The number of distinct frames is that of all
-    pairs of places, for two marks far apart, that the bounds of rotation and scale allow.
-    """
-    search = result.searches[placement.pitch_mm]
-    responses, shares, same_px = search.responses, [], 1
-    for index, place in found_px.items():
-        dilation = responses.dilated(search.key(placement, index), tolerance_px)
-        shares.append(dilation.share(reduced_px(place, responses.reduction)))
-        same_px = dilation.area_px
-    counts = np.arange(max(min(3, inside), 1), len(shares) + 1)
-    if len(counts) == 0:
-        return np.inf
-    likely = chance_of_marks(counts, inside, np.sort(shares)[counts - 1])
-    # Number of distinct frames: same_px neighbouring places of the reduced scan have the same dilated response.
-    extent_mm = float(np.hypot(*np.ptp(search.camera_mm, axis=0)))
-    span_px = extent_mm / float(search.pitch.mean()) / responses.reduction
-    places = next(iter(responses.maps.values())).size
-    second = 2 * search.bounds.rotation_rad * 2 * search.bounds.scale_tolerance * span_px**2
-    polarities = len({sign for _, sign in responses.maps})
-    different = places / same_px * second / same_px * len(search.distinct) * polarities
-    return float(len(counts) * likely.min() * different)
 
 
 def doubt_frame(result: SearchResult, frame: Frame) -> Reason:

@@ -361,6 +361,11 @@ def widen_lines(mark: MarkShape, ratio: float) -> MarkShape:
     return replace(mark, parts=tuple(widened))
 
 
+def is_made_of_areas(mark: LayoutMark) -> bool:
+    """Whether a mark consists of areas only, like wings, notches and arrows."""
+    return isinstance(mark.mark, MarkShape) and mark.mark.is_held_by_frame
+
+
 def finest_detail_mm(mark: Mark) -> float:
     """Width of the mark's thinnest line, or length of the shortest straight edge between corners of its outline."""
     if isinstance(mark, MarkTemplate):

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from measure.boards.find import recognise_board
 from measure.errors import MeasurementError
+from measure.marks.shapes import is_made_of_areas
 from measure.scans.opening import ScanHead, open_scan, read_head
 from measure.scans.parallel import map_items
 from measure.scans.remote import Address, list_addresses
@@ -22,7 +23,7 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.library import library_names, library_path
 from pipeline.files.scan_files import folders_below
-from pipeline.measuring.camera_identification import Identification, is_solid
+from pipeline.measuring.camera_identification import Identification
 from pipeline.measuring.camera_trials import identify
 from pipeline.progress import Count, Reporter
 from pipeline.provenance import alike_groups, content_hash, parts_hash
@@ -122,7 +123,7 @@ class ScanGroup:
         """Whether solid marks (wings, notches, arrows) alone identify the camera."""
         known = [] if self.has_telling_plate else [name for name in self.cameras if name in library_names()]
         marks = [mark for name in known for mark in read_camera(library_path(name)).layout().marks]
-        return bool(marks) and all(map(is_solid, marks))
+        return bool(marks) and all(map(is_made_of_areas, marks))
 
     @property
     def has_telling_plate(self) -> bool:
@@ -161,7 +162,8 @@ class ScanGroup:
                 f"of its marks alone, and {against}: compare the drawings with a scan"
             )
         if not self._counts:
-            return f"no camera stands out in {len(self.samples)} of them"
+            coarse = next((text for sample in self.samples if (text := sample.too_coarse())), "")
+            return f"no camera stands out in {len(self.samples)} of them{coarse and f'.{coarse}'.rstrip('.')}"
         counts_text = ", ".join(f"{name} in {self._counts[name]}" for name in self.candidates)
         if self._common:
             return f"the marks are those of {counts_text}, but the camera's plate in the picture names another camera"

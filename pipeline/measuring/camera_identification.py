@@ -13,9 +13,10 @@ from rich.padding import Padding
 from scipy.special import chdtrc
 
 from measure.annotations.lines import CAMERA, Line, find_fields
+from measure.fiducials.measurement import Coarseness
 from measure.flags import Code, Reason, Status
 from measure.marks.rendering import known_picture
-from measure.marks.shapes import FiducialLayout, LayoutMark, MarkShape, Polygon
+from measure.marks.shapes import FiducialLayout, LayoutMark, is_made_of_areas
 from measure.results import MarkMeasurement
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.scan_task import ScanTask
@@ -187,7 +188,7 @@ def _misfit(marks: Sequence[MarkMeasurement], camera: CameraFile, film_mm: float
 
 def drawn_alike(layouts: Mapping[tuple[str, ...], FiducialLayout]) -> dict[str, tuple[str, ...]]:
     """For each camera with solid marks only: the other cameras whose marks at nearly the same places look similar."""
-    solid = {names: layout for names, layout in layouts.items() if all(is_solid(mark) for mark in layout.marks)}
+    solid = {names: layout for names, layout in layouts.items() if all(is_made_of_areas(mark) for mark in layout.marks)}
     pictures = {names: [_picture(mark) for mark in layout.marks] for names, layout in solid.items()}
     rim = round(_OFF_MM * _PX_PER_MM)  # of the offsets at which drawings are compared
 
@@ -204,11 +205,6 @@ def drawn_alike(layouts: Mapping[tuple[str, ...], FiducialLayout]) -> dict[str, 
 
     others = {names: [other[0] for other in solid if other != names and alike(names, other)] for names in solid}
     return {name: tuple(own) for names, own in others.items() if own for name in names}
-
-
-def is_solid(mark: LayoutMark) -> bool:
-    """Whether a mark consists of areas only, like wings, notches and arrows."""
-    return isinstance(mark.mark, MarkShape) and all(isinstance(part, Polygon) for part in mark.mark.parts)
 
 
 def _picture(mark: LayoutMark) -> cv2.typing.MatLike:
@@ -272,6 +268,7 @@ class Identification:
     board : the calibration board in the image, as `reseau calibrate` takes it.
     is_negative : whether the scan shows the marks of the best trials with light and dark exchanged.
     solid : names of cameras with solid marks only.
+    layouts_coarseness : for each layout that was tried, the finest detail of its marks beside a pixel.
     """
 
     scan: Path
@@ -285,6 +282,7 @@ class Identification:
     board: str = ""
     is_negative: bool = False
     solid: Collection[str] = ()
+    layouts_coarseness: Sequence[Coarseness] = ()
 
     @property
     def best(self) -> tuple[Trial, ...]:
@@ -296,7 +294,7 @@ class Identification:
         if not self.best:
             return (
                 f"{self.scan.name}: no camera of the library stands out. Its marks may be none of those drawn, or too "
-                "faint; --pitch helps where the scan's file does not say it."
+                f"faint; --pitch helps where the scan's file does not say it.{self.too_coarse()}"
             )
         first = self.best[0]
         by_chance = f"{first.expected:.1g} false alarms expected in such a scan"
@@ -326,6 +324,21 @@ class Identification:
             )
         against = self.against_pitch()
         return text + self._plate_remark() + (f" {against}" if against else "")
+
+    def too_coarse(self) -> str:
+        """Sentence on the layouts for whose marks the scan is too coarse, with the pitches that would do; empty if a
+        camera is found or it is too coarse for none."""
+        coarse = [each for each in self.layouts_coarseness if each.is_too_coarse]
+        if self.best or not coarse:
+            return ""
+        needed_um = sorted(each.needed_um for each in coarse)
+        pixels_um = sorted({f"{each.pixel_um:.0f}" for each in coarse}, key=float)
+        return (
+            f" The scan may be too coarse: at {' to '.join(dict.fromkeys((pixels_um[0], pixels_um[-1])))} µm a pixel "
+            f"the finest detail of the marks is less than 3 px wide for {len(coarse)} of "
+            f"{counted(len(self.layouts_coarseness), 'layout')}. Scan at {needed_um[0]:.0f} µm or finer for all, at "
+            f"{needed_um[len(coarse) // 2]:.0f} µm for half of them."
+        )
 
     @property
     def is_likely_false(self) -> bool:

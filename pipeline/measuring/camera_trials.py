@@ -11,16 +11,15 @@ from scipy.spatial.distance import cdist
 
 from adjust.functional_model.transformation import film_kind, fit_transformation
 from measure.annotations.text import networks, read_writing
-from measure.fiducials.camera_recognition import CameraResponse, likeness, recognise_frame, search_camera
+from measure.fiducials.camera_recognition import LayoutSearch, Tried, boldest, likeness, same_marks
 from measure.fiducials.measure_frame import Frame
+from measure.fiducials.measurement import coarseness
 from measure.fiducials.options import FiducialOptions
-from measure.fiducials.search import Hypotheses, PitchHypothesis, longer, pitch_hypotheses
 from measure.flags import MAX_FALSE_CAMERAS
 from measure.geometry import linear_scale
-from measure.marks.shapes import FiducialLayout, LayoutMark, finest_detail_mm, limit_to_frame
+from measure.marks.shapes import FiducialLayout, finest_detail_mm, is_made_of_areas, limit_to_frame
 from measure.scans.opening import open_scan, thumbnail
 from measure.scans.parallel import one_opencv_thread
-from measure.scans.scan import Scan
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.camera_identification import (
     CLOSE,
@@ -28,25 +27,15 @@ from pipeline.measuring.camera_identification import (
     Trial,
     contradictions,
     drawn_alike,
-    is_solid,
     is_whole_plate,
     parse_plate,
 )
 from pipeline.progress import Count, Reporter
 from pipeline.types import Array
 
-_LARGEST_PX = 1600  # px, size of the searched image: for aerial film 1/7 mm per pixel, about the width of fine lines
-_COARSE_PX = 1024  # px, while the pitch is unknown: fine lines are then half a pixel wide
-_SOLID_PX = 800  # px, for solid marks, which have a size of some millimetres
-_COARSE_SOLID_PX = 512  # px, for solid marks while the pitch is unknown
 _LEAST_DETAIL_PX = 0.25  # width of the finest detail of marks below which nothing in a picture is one of them
-_PITCH_TOLERANCE = 0.02  # relative, of the pitch found by the coarse search
 _STRETCHES = (-0.025, 0.025)  # affinity of the pixels; each covers 1.1 to 3.9 % for an aerial camera
-_ALIKE_MM = 0.1  # mm: cameras whose marks lie closer to one another cannot be distinguished in a scan
-_BOLD = 4  # smallest number of marks to search
-_ENOUGH = 12  # marks to measure: of layouts with more, such as réseaux, only every second mark is measured
 _SAME_FIGURE = 0.06  # fraction of the rms distance of the marks from their centroid
-_STRETCH = (1.08, 0.93)  # x and y scale of the null layout: no film is so deformed, so all its marks are false alarms
 Names = tuple[str, ...]
 
 _PICTURE_PX = 2400  # px, size of the measured image: for aerial film 0.1 mm per pixel, enough to read plates
@@ -55,120 +44,6 @@ _BY_CHANCE = 1.0  # expected false alarms: the constellation may be one
 _HOPELESS = 100.0  # expected false alarms: above it, the marks are not measured
 _ODDS = 1000.0  # ratio of the expected false alarms of two layouts: the rarer one is present, the other is not
 _AFFINE = 6  # parameters of an affine transformation
-
-
-@dataclass(frozen=True, eq=False)
-class Tried:
-    """Search result of one layout.
-
-    Attributes
-    ----------
-    bold : its boldest marks, which are searched.
-    picture : the searched image, the scan at reduced size.
-    hypotheses : pixel pitches that were tried.
-    before : number of other hypotheses tried before, counted in the expected false alarms.
-    answer : correlation result of the bold marks.
-    """
-
-    layout: FiducialLayout
-    bold: FiducialLayout
-    picture: Scan
-    hypotheses: Hypotheses
-    before: int
-    answer: CameraResponse
-
-
-class LayoutSearch:
-    """Search for layouts in one scan, or in a thumbnail of it that is large enough to measure the marks."""
-
-    def __init__(self, scan: Scan) -> None:
-        self._scan = scan
-        self._fine = thumbnail(scan, _LARGEST_PX)
-        self._coarse, self._solid, self._coarse_solid = (
-            thumbnail(self._fine, side_px) for side_px in (_COARSE_PX, _SOLID_PX, _COARSE_SOLID_PX)
-        )
-        self._known: list[Tried] = []
-
-    def try_pitch(
-        self, layout: FiducialLayout, pitch_um: tuple[float, float], stretches: Sequence[float] = ()
-    ) -> Tried:
-        """Search at the scan's pitch.
-
-        stretches: of pixels that are not square, beyond the affinity that this search allows; then only these are
-        tried.
-        """
-        bold = _boldest(layout)
-        picture = self._solid if all(is_solid(mark) for mark in bold.marks) else self._fine
-        times = self._scan.width_px / picture.width_px
-        options = FiducialOptions(pitch_is_right=True)
-        ((given,), *_) = pitch_hypotheses(picture, bold, (times * pitch_um[0], times * pitch_um[1]), options)
-        hypotheses = [longer(given, each) for each in stretches] or [given]
-        return self._try_layout(_some(layout), bold, picture, hypotheses, before=1 if stretches else 0)
-
-    def try_any_pitch(self, layout: FiducialLayout) -> Tried:
-        """Search without a pitch: the frame is assumed to fill the scan, and the pixels to be square."""
-        bold = _boldest(layout)
-        picture = self._coarse_solid if all(is_solid(mark) for mark in bold.marks) else self._coarse
-        return self._try_layout(
-            _some(layout), bold, picture, pitch_hypotheses(picture, bold, None, FiducialOptions())[0]
-        )
-
-    def refine(self, coarse: Tried) -> Tried:
-        """Repeat the search in a larger image, at the pitch of the best placement."""
-        if not coarse.answer.placements:
-            return coarse
-        picture = self._solid if coarse.picture is self._coarse_solid else self._fine
-        px_per_mm = linear_scale(coarse.answer.placements[0].pixel_from_camera)
-        pitch_mm = coarse.picture.width_px / picture.width_px / px_per_mm
-        hypothesis = PitchHypothesis((pitch_mm, pitch_mm), _PITCH_TOLERANCE, (pitch_mm, pitch_mm))
-        return self._try_layout(coarse.layout, coarse.bold, picture, [hypothesis], len(coarse.hypotheses))
-
-    def stretch(self, tried: Tried) -> Tried:
-        """Repeat the search for the stretched layout, whose marks are in wrong places."""
-        layout, bold = _stretched_layout(tried.layout), _stretched_layout(tried.bold)
-        return self._try_layout(layout, bold, tried.picture, tried.hypotheses, tried.before)
-
-    def recognise(self, tried: Tried) -> Frame | None:
-        """Measure the marks of a layout at its best placement."""
-        return recognise_frame(self._scan, tried.layout, tried.answer, self._scan.width_px / tried.picture.width_px)
-
-    def _try_layout(
-        self, layout: FiducialLayout, bold: FiducialLayout, picture: Scan, hypotheses: Hypotheses, before: int = 0
-    ) -> Tried:
-        for known in self._known:
-            if known.picture is picture and known.hypotheses == hypotheses and same_marks(known.bold.marks, bold.marks):
-                return replace(known, layout=layout)
-        answered = search_camera(picture, bold, hypotheses, before)
-        self._known.append(Tried(layout, bold, picture, hypotheses, before, answered))
-        return self._known[-1]
-
-
-def same_marks(first: Sequence[LayoutMark], second: Sequence[LayoutMark]) -> bool:
-    """Whether the marks of two layouts cannot be distinguished in a scan."""
-    return len(first) == len(second) and all(
-        repr(a.mark) == repr(b.mark) and np.hypot(a.xy_mm[0] - b.xy_mm[0], a.xy_mm[1] - b.xy_mm[1]) < _ALIKE_MM
-        for a, b in zip(first, second, strict=True)
-    )
-
-
-def _boldest(layout: FiducialLayout) -> FiducialLayout:
-    """The layout's most visible marks, if there are enough: solid ones, or else those with the widest lines."""
-    groups: dict[float, list[LayoutMark]] = {}
-    for mark in layout.marks:
-        groups.setdefault(np.inf if is_solid(mark) else mark.mark.thinnest_mm, []).append(mark)
-    enough = [width for width, marks in groups.items() if len(marks) >= _BOLD]
-    return replace(layout, marks=tuple(groups[max(enough)])) if enough else layout
-
-
-def _some(layout: FiducialLayout) -> FiducialLayout:
-    """Thin out a layout with many marks: half of them suffice to detect it."""
-    return replace(layout, marks=layout.marks[:: 1 if len(layout.marks) <= _ENOUGH else 2])
-
-
-def _stretched_layout(layout: FiducialLayout) -> FiducialLayout:
-    x, y = _STRETCH
-    marks = tuple(replace(mark, xy_mm=(x * mark.xy_mm[0], y * mark.xy_mm[1])) for mark in layout.marks)
-    return replace(layout, marks=marks)
 
 
 @one_opencv_thread()  # a second one takes 45 MiB
@@ -193,10 +68,11 @@ def identify(
     """
     with open_scan(path, max_pixels) as whole:
         picture = thumbnail(whole, _PICTURE_PX)
-        times, its_pitch_um = whole.width_px / picture.width_px, whole.pitch_um
+        size_px, its_pitch_um = (whole.width_px, whole.height_px), whole.pitch_um
     del whole  # frees the decoded picture
     given, search = its_pitch_um if pitch_um is None else (pitch_um, pitch_um), LayoutSearch(picture)
     layouts = {names: _limit_drawings(cameras[names[0]].layout()) for names in _alike(cameras)}
+    times = size_px[0] / picture.width_px
     pitch = None if given is None else (times * given[0], times * given[1])
     with reporter.stage("trying layout") as count:
         trials, tries, is_negative = list[Trial](), dict[Names, Tried](), False
@@ -218,9 +94,20 @@ def identify(
     plate = {} if reader is None else parse_plate(read_writing(picture, reader, enough=is_whole_plate))
     against_plate = {name: contradictions(camera, plate) for name, camera in cameras.items()}
     contradicted = {name: against for name, against in against_plate.items() if against}
-    solid = {name for names, layout in layouts.items() if all(map(is_solid, layout.marks)) for name in names}
+    solid = {name for names, layout in layouts.items() if all(map(is_made_of_areas, layout.marks)) for name in names}
+    coarse = tuple(coarseness(layout, size_px, given) for layout in layouts.values())
     return Identification(
-        path, ranked, unreported, given, plate, contradicted, alike, reports, is_negative=is_negative, solid=solid
+        path,
+        ranked,
+        unreported,
+        given,
+        plate,
+        contradicted,
+        alike,
+        reports,
+        is_negative=is_negative,
+        solid=solid,
+        layouts_coarseness=coarse,
     )
 
 
@@ -237,7 +124,7 @@ def _layouts_like(layouts: Mapping[Names, FiducialLayout], likely: Collection[st
 
 def _figure(layout: FiducialLayout) -> Array:
     """(n, 2) places of the boldest marks, centred and scaled to an rms distance of 1."""
-    places = np.array([mark.xy_mm for mark in _boldest(layout).marks])
+    places = np.array([mark.xy_mm for mark in boldest(layout).marks])
     places = places - places.mean(axis=0)
     return np.asarray(places / np.sqrt((places**2).sum(axis=1).mean()))
 

@@ -691,11 +691,13 @@ def test_under_another_pitch_the_marks_together_decide_on_a_frame(monkeypatch: p
     frame.placement = Placement("0", np.eye(2, 3), 1.0, 3, 1, 1, (0.05, 0.05))
     for function, value in (("measure_frame", frame), ("false_placements", 1e-4), ("false_frames", 0.5)):
         monkeypatch.setattr(stages, function, lambda *_, value=value: value)
-    monkeypatch.setattr(stages, "detect_some", lambda *_: frame)
+    monkeypatch.setattr(stages, "detect_some", lambda *_: None)
     stage = Stage("pitch", [GIVEN], FiducialOptions())
     ((expected, found),) = stages.measure_stage(SCAN, ALIKE, stage, SearchResult((frame.placement,)), 5)
     assert found is frame
     assert expected == pytest.approx(1e-3)  # two criteria, five hypotheses
+    monkeypatch.setattr(stages, "false_placements", lambda *_: 1.0)  # then a clear mark is wanted
+    assert stages.measure_stage(SCAN, ALIKE, stage, SearchResult((frame.placement,)), 5) == []
 
 
 def test_of_frames_that_are_all_significant_the_one_with_most_marks_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 import re
 import sys
+import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -18,14 +19,16 @@ from studies import parametrize_with_studies
 
 from measure import FiducialOptions, FrameMeasurement, Scan, Status, measure_fiducials, open_scan
 from measure.detection.responses import SearchEffort
+from measure.fiducials import stages
 from measure.fiducials.channel_weights import best_weights, registered_channels
+from measure.fiducials.measure_frame import Frame
+from measure.fiducials.measurement import coarseness
 from measure.fiducials.options import CLICK_SIGMA_PX, Click
 from measure.fiducials.scan_checks import other_frames, pitch_problem
-from measure.fiducials.search import FrameSearch, PitchHypothesis, is_lattice
-from measure.fiducials.stages import false_placements
+from measure.fiducials.search import FrameSearch, PitchHypothesis, SearchResult, false_placements, is_lattice
 from measure.flags import Cause, Code, Reason
 from measure.geometry import POSES
-from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, ring_cross
+from measure.marks.shapes import Disk, FiducialLayout, LayoutMark, MarkShape, cross, ring_cross
 from measure.marks.templates import cut
 from measure.results import Covariance, MarkMeasurement, shift_frame
 from measure.scans.metadata import Samples
@@ -68,6 +71,43 @@ def test_wrong_resolution_tags_are_named_with_the_pitch_of_the_marks(tmp_path: P
     wide, tall = map(float, problem.partition("pitch_um = [")[2].partition("]")[0].split(","))
     assert (wide, tall) == pytest.approx((50.0, 51.0), abs=0.1)
     assert pitch_problem(result, draw.ALIKE, pitch_um, "the scan's file") is None  # once is enough
+
+
+def test_a_wrong_tag_costs_a_thumbnail_one_search_and_one_measured_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nine crosses 7 mm apart; at four times their pitch four of them lie on others."""
+    places = [(7.0 * column, 7.0 * row) for column in (-1, 0, 1) for row in (-1, 0, 1)]
+    layout, matrix = draw.lay_out([MarkShape(draw.RING_CROSS)] * 9, places), draw.pixel_from_camera("0")
+    scan = draw.make_scan(draw.frame_picture(layout, matrix))
+    searched_um, measured_um = list[float](), list[float]()
+    search_scan, measure_frame = FrameSearch.search_scan, stages.measure_frame
+
+    def counted_search(self: FrameSearch, options: FiducialOptions, hypotheses: Any, surroundings: Any) -> SearchResult:
+        searched_um.extend(1000 * each.drawn_mm[0] for each in hypotheses)
+        return search_scan(self, options, hypotheses, surroundings)
+
+    def counted_measurement(*given: Any) -> Frame:
+        measured_um.append(1000 * given[2].pitch_mm[0])
+        return measure_frame(*given)
+
+    monkeypatch.setattr(FrameSearch, "search_scan", counted_search)
+    monkeypatch.setattr(stages, "measure_frame", counted_measurement)
+    tracemalloc.start()
+    result = measure_fiducials(scan, layout, (4 * draw.PITCH_UM, 4 * draw.PITCH_UM))
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    draw.assert_right(result, layout, matrix)
+    assert searched_um == pytest.approx([4 * draw.PITCH_UM, draw.PITCH_UM], rel=0.02)
+    assert measured_um == pytest.approx([draw.PITCH_UM], rel=0.02)
+    assert peak_bytes < 32 * 4 * draw.FRAME_PX**2  # 23 maps of single precision; 63 where all pitches were searched
+
+
+def test_the_pitch_that_would_do_is_a_third_of_the_finest_detail() -> None:
+    layout = draw.lay_out([MarkShape(cross(2.0, 0.3))] * 4, frame_mm=(228.0, 228.0))
+    assert not coarseness(layout, (1000, 900), (100.0, 99.0)).is_too_coarse
+    assert coarseness(layout, (1000, 900), (101.0, 99.0)) == pytest.approx((300.0, 101.0))
+    assert coarseness(layout, (1000, 900), (101.0, 99.0)).needed_um == pytest.approx(100.0)
+    assert coarseness(layout, (1000, 900), None).pixel_um == pytest.approx(228.0)  # as if the frame filled the scan
+    assert coarseness(layout, (1000, 900), None).is_too_coarse
 
 
 @pytest.mark.study

@@ -25,6 +25,7 @@ from studies import parametrize_with_studies
 from truth_comparison import compare_frames
 
 from measure import FiducialOptions, measure_fiducials, open_scan
+from measure.fiducials.measurement import Coarseness
 from measure.flags import Code
 from measure.marks.rendering import known_picture
 from measure.marks.shapes import Mark, MarkShape, Polygon
@@ -137,6 +138,8 @@ def test_a_camera_is_known_by_most_samples_and_by_what_its_plate_does_not_contra
         fake_identification = fake_group(group, *samples)
         assert fake_identification.cameras == ()
         assert why in fake_identification.why_not()
+    coarse = replace(identify_camera(path), layouts_coarseness=[Coarseness(um, 313.0) for um in (1000.0, 300.0, 60.0)])
+    assert "for 2 of 3 layouts. Scan at 20 µm or finer for all, at 100 µm" in fake_group(group, coarse).why_not()
     form = identify_camera(path, "zeiss-rmk-a-153", beside="arrow-153")
     assert fake_group(group, form).camera == ""
     assert "compare the drawings" in fake_group(group, form).sentence()
@@ -493,6 +496,11 @@ def test_marks_finer_than_the_pixels_are_not_those_of_a_camera(tmp_path: Path) -
     found = identify(tmp_path / "coarse.tif", few, None, Reporter(quiet=True))
     assert found.best == ()
     assert found.trials[0].reason == "too coarse: the finest detail of its marks would be 0.20 px wide there"
+    # Lines of 0.12 mm in a frame of 228 mm that fills 400 px.
+    assert "too coarse: at 570 µm a pixel the finest detail" in found.sentence()
+    assert "Scan at 40 µm or finer" in found.sentence()
+    named = replace(found, trials=(trial(("wild-rc5-153",), 0.9),))
+    assert "too coarse" not in named.sentence()
 
 
 def test_a_negative_names_its_camera(tmp_path: Path) -> None:
