@@ -20,8 +20,8 @@ Nothing is reported unless all that is reported removes more than half of the ex
 
 Where a standard deviation of unmodelled errors was estimated from the residuals, v'Pv equals its redundancy whatever
 the model lacks. A hypothesis then has to remove more than half of what is unmodelled; or, where errors are correlated
-within images, LEAST_SHARE of v'Pv, and groups of images must be clearer than a normal scatter of the images' interior
-orientations makes them, principal distances of their own scatter more than principal points.
+within images, LEAST_SHARE of v'Pv; groups of images more than a scatter of the images' interior orientations, and
+principal distances of their own have to scatter more than principal points.
 """
 
 from collections.abc import Iterator
@@ -204,8 +204,8 @@ class _Model:
         is_large = excess_fall > share * LEFT * self.unmodelled * self.vpv or (
             # Curled edges of real boards remove up to 0.3 as points beside a line.
             hypothesis.name != "group"
-            and excess_fall > LEAST_SHARE * self.vpv
-            and hypothesis.selection.p_scatter() < LEVEL
+            and excess_fall > max(LEAST_SHARE, hypothesis.selection.share) * self.vpv
+            and hypothesis.selection.p_scatter < LEVEL
         )
         return is_large and self.probability(hypothesis, fall) < level
 
