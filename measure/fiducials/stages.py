@@ -209,12 +209,13 @@ def find_in_negative(
 ) -> StageResult | None:
     """Find the frame of a scan that is a negative of what the layout draws; None without a significant one.
 
-    The prior belief about the scan and the likeliest other pitches must do: scans without a frame would take twice as
-    long.
+    The prior belief about the scan and other pitches without the least likely must do: scans without a frame would
+    take twice as long.
     """
     shown = layout.negative
     likely = [each for each in list_stages(scan, shown, pitch_um, options) if each.tone is None]
-    stages = [each for each in likely if each.is_given] + [each for each in likely if each.kind == "pitch"][:1]
+    others = [each for each in likely if each.kind == "pitch"]
+    stages = [each for each in likely if each.is_given] + others[: max(1, len(others) - 1)]
     found = _find_in_stages(scan, shown, stages, options)
     return found if found.is_taken and not found.doubt else None
 

@@ -395,6 +395,18 @@ def test_a_frame_moved_on_by_the_distance_of_two_marks_is_known_by_its_marks() -
     assert not frame.contains(frame)
 
 
+def test_a_negative_whose_pitch_is_wrong_is_searched_for_where_it_fills_the_scan(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    listed = list[Stage]()
+    monkeypatch.setattr(stages, "_find_in_stages", lambda *given: listed.extend(given[2]) or StageResult())
+    for pitch_mm in (1 / PX_PER_MM, 4 / PX_PER_MM):
+        listed.clear()
+        stages.find_in_negative(make_scan(picture(DOTS, "0")), DOTS, (1000 * pitch_mm,) * 2, OPTIONS)
+        ratios = [each.mm[0] * PX_PER_MM for stage in listed for each in stage.hypotheses]
+        assert any(abs(ratio - 1) < 0.1 for ratio in ratios)
+
+
 def test_specks_that_lie_as_three_marks_of_four_are_doubted_with_numbers() -> None:
     as_marks = np.rint(centers_px(DOTS, "0")).astype(int)
     elsewhere = np.random.default_rng(1).integers(10, 360, (300, 2))
