@@ -46,7 +46,6 @@ _ITERATIONS, _HALVINGS = 15, 4  # fits that need more steps or more halvings do 
 _AREA_PX = 0.5  # px: a larger movement of the mark requires a new area
 _LEAST_AREA_PX = 40  # pixels required around a mark
 _DAMAGE_SIGMAS = 3.2  # of smoothed residuals: exceeded by one pixel in 700 without damage
-_PLAIN, _PLAIN_SHARE = 2.0, 0.7  # variance ratio that grain may produce; fraction of far pixels that must be undamaged
 _LEAST_VARIANCE_DN2 = 1e-12  # lower bound for images without noise, to divide by
 _WEIGHTED_STEPS = 4  # steps with the grain's weights; the place is nearly final before
 _CLOSE_PX, _SETTLED_PX = 0.002, 0.02  # px: step that ends the iteration; longest last step accepted as converged
@@ -189,8 +188,6 @@ class PictureFit(FitModel):
             self.used = undamaged
             if self.informative.sum() < 3 * len(self.model.design):
                 self.reason = Reason("too little of the mark is undamaged", Code.COVERED)
-            elif round_ == 0 and not self._is_plain():
-                self.reason = Reason("the background of the mark is not uniform", Code.NO_FIT)
             self._adjust(0.002)
 
     def choose_area(self) -> None:
@@ -375,8 +372,9 @@ class PictureFit(FitModel):
     @property
     def damaged_fraction(self) -> float:
         """Fraction of the pixels within plain_px of the mark that are damaged or adjacent to damage."""
-        near = self.area & ~self.far
-        return 1.0 - float((near & self._clear).sum() / max(near.sum(), 1))
+        near, damaged = self.area & ~self.far, self.area & ~self.used
+        near_damage = damaged if self.window.is_lossy else dilate_mask(damaged)
+        return float((near & near_damage).sum() / max(near.sum(), 1))
 
     @property
     def lost_fraction(self) -> float:
@@ -389,17 +387,3 @@ class PictureFit(FitModel):
             for design in (self.model.design[:, pixels] for pixels in (self.area, self.used))
         )
         return 1.0 - float(1 / np.linalg.eigvals(by_used @ np.linalg.inv(by_all)).real.max())
-
-    @property
-    def _clear(self) -> Mask:
-        """Mask of the used pixels that are not adjacent to damage."""
-        return self.used if self.window.is_lossy else self.used & ~dilate_mask(self.area & ~self.used)
-
-    def _is_plain(self) -> bool:
-        """Whether undamaged pixels far from the mark scatter like the nearer ones."""
-        near, far = self._clear & ~self.far, self._clear & self.far
-        squares = self.model.residuals**2
-        plain = far.sum() >= _PLAIN_SHARE * (self.area & self.far).sum()
-        return bool(
-            not far.any() or (plain and squares[far].mean() < _PLAIN * (squares[near].mean() + self.floor_dn**2))
-        )

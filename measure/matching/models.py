@@ -60,7 +60,7 @@ class MatchOptions:
     strain_sigma : prior standard deviation of stretch and shear, likewise.
     margin_px : grey values are used up to this distance around the mark.
     margin_blurs : the margin in standard deviations of the blur, used where it is larger.
-    plain_px : distance beyond which grey values must not vary much more than the nearer ones, else the match fails.
+    plain_px : distance from the mark up to which damage counts.
     damage_rounds : rounds of detecting and masking damage and readjusting; 0: damage stays in.
     max_shift_px : largest distance from the initial place.
     estimate_sharpening : whether to estimate sharpening even if the scan is not known to be sharpened.
