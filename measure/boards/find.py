@@ -34,6 +34,7 @@ _REFINED, _REFINING_END = 0.3, (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS,
 _INTO_SQUARE = 0.3  # in squares from the corner, where a square's grey value is sampled
 _CROSSING = 0.25  # fraction of the board's contrast required between all neighbours of the four squares
 _SMOOTHED_PX = 10.0  # px, side from which on squares are sampled as means of 3 x 3 pixels
+_COVERED = 0.3  # fraction of a further line, at least one corner, that may be covered: a clipboard's clip resembles 2/3
 _MOST_LINES = 500  # limit of the lines of a board along a side
 _THOROUGHLY = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _DRAWINGS = 3  # random seeds tried for a second board: one in twenty missed one at the edge
@@ -129,7 +130,8 @@ def _grown(picture: Bytes, grid: Array, contrast: float) -> tuple[Array, bool]:
             return grid, False
         parity = -parity
         crossings = parity * _crossing_contrast(picture, further[:3])[0]
-        if 2 * np.sum(crossings[inside] > _CROSSING * contrast) < inside.sum() or len(further) > _MOST_LINES:
+        covered = np.sum(crossings[inside] <= _CROSSING * contrast)
+        if covered > max(_COVERED * inside.sum(), 1) or len(further) > _MOST_LINES:
             return grid, True
         further[0] = _refined(picture, further[:2])[0]
         grid = further

@@ -253,6 +253,18 @@ def test_strong_sharpening_makes_no_corner_weak(large_board: tuple[Array, dict[s
     assert np.abs(draw.errors_px(board, truth)).max() < 0.1
 
 
+def test_the_clip_of_a_clipboard_is_no_further_column(large_board: tuple[Array, dict[str, Array]]) -> None:
+    """It looks like three of six corners, and the board had been refused as one of 10 x 6."""
+    square, longer = draw.chessboard_dark(LARGE), draw.chessboard_dark(replace(LARGE, columns=10))
+
+    def dark(x: Array, y: Array) -> Array:
+        return np.asarray(square(x, y) | (longer(x, y) & (np.abs(x - 223.0) < 5.0) & (np.abs(y - 60.0) < 36.0)))
+
+    board = measure_board(draw.make_scan(draw.take_picture(LARGE, draw.board_from_pixel(8.0, 3e-4), dark)), LARGE)
+    assert not board.reason
+    assert np.abs(draw.errors_px(board, large_board[1])).max() < 0.05
+
+
 @parametrize_with_studies("shown", [np.s_[80:, 150:], np.s_[:, 60:250], np.s_[80:, 60:250]])
 def test_a_part_that_may_be_another_is_refused(large_board: tuple[Array, dict[str, Array]], shown: Any) -> None:
     """Of one corner's border with fewer squares than tell the longer side; and without an end of the longer side."""
