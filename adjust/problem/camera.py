@@ -54,6 +54,7 @@ class Camera:
     center_mm : centre of the frame in the camera frame.
     frame_mm : width and height of the image, 0 where unknown.
     distances : distances between fiducials, observed in addition to, or instead of, their coordinates.
+    pixel_mm : side of a pixel of a digital camera, whose messages are then in px; else None.
     """
 
     name: str
@@ -65,6 +66,13 @@ class Camera:
     center_mm: tuple[float, float] = (0.0, 0.0)
     frame_mm: tuple[float, float] = (0.0, 0.0)
     distances: tuple[FiducialDistance, ...] = ()
+    pixel_mm: float | None = None
+
+    def image_unit(self, per_mm: float = 1.0, name: str = "mm") -> tuple[Array, str]:
+        """Units of x and y in messages per mm, and their name: px, y down, of known pixels; else the given one."""
+        if self.pixel_mm is None:
+            return np.full(2, per_mm), name
+        return np.array([1.0, -1.0]) / self.pixel_mm, "px"
 
     def frame_corners(self, xy_mm: Array, frame_mm: tuple[float, float] | None = None) -> Corners | None:
         """Lower left and upper right corner of the image in the camera frame; None where its size is unknown.

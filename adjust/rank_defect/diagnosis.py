@@ -438,9 +438,10 @@ def inseparable(problem: Problem, state: State, variances: Array) -> dict[str, t
     for name in problem.unknowns.camera:
         names = [each for each, i in problem.lens_positions(name).items() if i in inseparable_positions]
         if names:
-            radius_mm = observed_radius_mm(problem, state, name)
+            per_mm, unit = problem.network.camera_by_name[name].image_unit()
+            radius = per_mm[0] * observed_radius_mm(problem, state, name)
             sentence = (
-                f"{enumeration(names)} of camera {name} cannot be separated: up to {radius_mm:.3g} mm from the "
+                f"{enumeration(names)} of camera {name} cannot be separated: up to {radius:.3g} {unit} from the "
                 "principal point, as far as targets were observed, they do the same. The distortion itself is known "
                 "there. Use its parameters together, not one by one, or estimate fewer of them."
             )

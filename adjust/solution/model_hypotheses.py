@@ -161,7 +161,7 @@ def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     if not free.intersection(of_decentering[2:]):
         words = _too_simple_words(camera, "decentering", "a tangential pattern (decentering)")
         rows.append(("decentering", decentering(int(bool(free.intersection(of_decentering)))), words))
-    rows.append(("bow", BOW, partial(_bow_words, camera.name)))
+    rows.append(("bow", BOW, partial(_bow_words, camera)))
     if all(image.transformation == "none" for image in images):
         affinity: tuple[tuple[str, Words], ...] = (
             ("pixels", _pixel_words(camera.name, 1.0 / half_mm)),
@@ -192,14 +192,16 @@ def _too_simple_words(camera: Camera, group: str, what: str) -> Words:
     wrong = [name for name in names if name in held]
     doubt = f", or what is given as exact, {', '.join(wrong)}, is wrong" if wrong else ""
     cause = f"The lens model of camera {camera.name} is too simple{doubt}: the residuals have {what}"
-    return lambda found: (f"{cause}, {found.rms_um:.2g} µm rms", remedy)
+    per_mm, unit = camera.image_unit(UM_PER_MM, "µm")
+    return lambda found: (f"{cause}, {per_mm[0] * found.rms_um / UM_PER_MM:.2g} {unit} rms", remedy)
 
 
-def _bow_words(camera: str, found: Estimate) -> tuple[str, str]:
-    (x_um, y_um), sigma_um = UM_PER_MM * found.value, UM_PER_MM * found.sigma
+def _bow_words(camera: Camera, found: Estimate) -> tuple[str, str]:
+    per_mm, unit = camera.image_unit(UM_PER_MM, "µm")
+    (x, y), sigma = per_mm * found.value, np.abs(per_mm) * found.sigma
     return (
-        f"The pictures of camera {camera} are bowed: half the frame off the middle, columns lie {x_um:+.3g} ± "
-        f"{sigma_um[0]:.1g} µm aside and rows {y_um:+.3g} ± {sigma_um[1]:.1g} µm",
+        f"The pictures of camera {camera.name} are bowed: half the frame off the middle, columns lie {x:+.3g} ± "
+        f"{sigma[0]:.1g} {unit} aside and rows {y:+.3g} ± {sigma[1]:.1g} {unit}",
         "Look for a rolling shutter, stabilisation or a scanner's lens. Use a distortion family with such "
         "terms, for example legendre(3).",
     )
@@ -337,14 +339,18 @@ def _jumps(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
         return
     for jump in partitions.jumps(run, rows):
         who = f"image {jump.image}" if jump.image else f"the images of camera {camera.name}"
-        where = f"{'above' if jump.axis else 'right of'} {'xy'[jump.axis]} = {jump.cut_mm:.4g} mm"
+        per_mm, unit = camera.image_unit()
+        where = (
+            f"{'above' if jump.axis else 'right of'} {'xy'[jump.axis]} = {per_mm[jump.axis] * jump.cut_mm:.4g} {unit}"
+        )
 
         def words(found: Estimate, who: str = who, where: str = where) -> tuple[str, str]:
-            (x_um, y_um), sigma_um = UM_PER_MM * found.value, UM_PER_MM * found.sigma
+            per_mm, unit = camera.image_unit(UM_PER_MM, "µm")
+            (x, y), sigma = per_mm * found.value, np.abs(per_mm) * found.sigma
             return (
-                f"All marks of {who} {where} are displaced against the others, by ({x_um:+.3g}, {y_um:+.3g}) ± "
-                f"({sigma_um[0]:.1g}, {sigma_um[1]:.1g}) µm: the scanner or sensor jumps there",
-                "Scan it or take the picture again, or check whether it was joined from parts.",
+                f"All marks of {who} {where} are displaced against the others, by ({x:+.3g}, {y:+.3g}) ± "
+                f"({sigma[0]:.1g}, {sigma[1]:.1g}) {unit}: the sensor, or what copied the picture, jumps there",
+                "Take or scan the picture again, or check whether it was joined from parts.",
             )
 
         fields_mm = jump.beyond[:, None, None] * np.eye(2)

@@ -160,10 +160,12 @@ def _principal_point(view: _CameraView, result: Adjustment, family: float) -> It
     name, picture, kind = view.camera.name, view.picture, "outside the picture"
     at = result.run.problem.unknowns.camera[name][1:3]
     found = result.values[at]
-    words = f"The principal point of camera {name} is found at ({found[0]:.4g}, {found[1]:.4g}) mm"
+    words = f"The principal point of camera {name} is found at"
     if far := _far_from_given(view.camera, found, result, family):
-        yield f"{words}, {far}"
+        yield f"{words} ({found[0]:.4g}, {found[1]:.4g}) mm, {far}"
         return
+    per_mm, unit = view.camera.image_unit()
+    x, y = per_mm * found
     if picture is None:
         low, high = (np.array([limit(values) for values in view.xy_mm.T]) for limit in (np.min, np.max))
         reach = AROUND * (high - low).max()
@@ -172,12 +174,12 @@ def _principal_point(view: _CameraView, result: Adjustment, family: float) -> It
             picture = np.array([np.minimum(picture[0], 0.0), np.maximum(picture[1], 0.0)])
         kind = "outside all that the marks cover"
     if _is_outside(picture, found[None])[0]:
-        (left, lower), (right, upper) = picture
+        (left, right), (lower, upper) = np.sort(per_mm * picture, axis=0).T
         yield (
-            f"{words}, {kind} (x from {left:g} to {right:g}, y from {lower:g} to {upper:g} mm), where no lens has it: "
-            "the images do not tell it from their tilts, or points are misnamed or misplaced. Give principal_point_mm "
-            "with its standard deviation (0 fixes it), or add images with other tilts; check the points' numbers and "
-            "coordinates."
+            f"{words} ({x:.4g}, {y:.4g}) {unit}, {kind} (x from {left:g} to {right:g}, y from {lower:g} to {upper:g} "
+            f"{unit}), where no lens has it: the images do not tell it from their tilts, or points are misnamed or "
+            "misplaced. Give principal_point_mm with its standard deviation (0 fixes it), or add images with other "
+            "tilts; check the points' numbers and coordinates."
         )
 
 

@@ -281,9 +281,11 @@ def curved_valley_warnings(run: Run, cofactor: Cofactor) -> Iterator[str]:
             least, sign = min(rises, default=(np.inf, 0.0))
             if least < CURVED * FAR**2:
                 what = problem.unknowns.parameters[position].quantity
+                per_mm, unit = problem.network.camera_by_name[name].image_unit()
+                moved_by = per_mm[list(positions).index(position) - 1] * sign * FAR * sigma[k]
                 yield (
                     f"The images hardly tell {what} of camera {name} from its distortion, and its standard deviation "
-                    f"is too small: moved by {sign * FAR * sigma[k]:+.2g} mm, {FAR:g} of them, it fits "
+                    f"is too small: moved by {moved_by:+.2g} {unit}, {FAR:g} of them, it fits "
                     f"{'better' if least < 0.0 else 'nearly as well'} (v'Pv rises by {least:.2g}, not by {FAR**2:g}). "
                     "Hold the decentering distortion at 0, give principal_point_mm, or add images with other tilts."
                 )

@@ -101,6 +101,7 @@ def adjust_marks(project: Project, marks: Sequence[ComparatorPoint]) -> Adjustme
     pitch_um = project.pitch_um or project.list_pitch_um
     is_digital = all(image.transformation == "none" for image in network.images)
     pixel_mm = float(np.mean(pitch_um)) / 1000.0 if is_digital and pitch_um else None
+    network = replace(network, cameras=tuple(replace(each, pixel_mm=pixel_mm) for each in network.cameras))
     if project.adjust.unmodelled == "estimate":
         first = adjust_unmodelled(network, options, pixel_mm)
     else:

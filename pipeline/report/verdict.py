@@ -265,9 +265,10 @@ def _lens_problems(data: ReportData, solved: AdjustmentRecord) -> Iterator[Repor
     for name, camera in solved.cameras.items():
         c = camera.principal_distance_mm
         sigma = max(c.sigma, c.sigma_clusters or 0.0)
-        if not (c.given and math.isfinite(c.given.sigma)) and sigma > LOOSE * c.value:
+        is_said = any(each.startswith(f"The principal distance of camera {name} is") for each in solved.warnings)
+        if not (c.given and math.isfinite(c.given.sigma)) and sigma > LOOSE * c.value and not is_said:
             yield ReportedProblem(
-                f"The principal distance of {name} is known to {100.0 * sigma / c.value:.1g} % only: the images "
+                f"The principal distance of {name} is known to {100.0 * sigma / c.value:.0f} % only: the images "
                 "hardly separate it from how far away they were taken.",
                 "Tilt the board, or the camera, by 20 to 45 degrees in different directions.",
                 section="camera",

@@ -446,6 +446,18 @@ def test_a_picture_of_another_print_is_named_and_no_other(odd: tuple[str, ...], 
     assert all("another print of the board" in why for why in found.values())
 
 
+def test_what_is_wrong_with_pictures_is_told_in_pixels(tmp_path: Path) -> None:
+    """The µm were those of a pixel that nobody had given. Right of 150 px marks lie 0.3 px right and 0.2 px lower."""
+    project, marks = simulated_marks(tmp_path)
+    shift_mm = 0.005 * np.array([0.3, -0.2])
+    places = [(mark, present(mark.xy_mm)) for mark in marks]
+    moved = [replace(mark, xy_mm=xy_mm + (xy_mm[0] > 0.75) * shift_mm) for mark, xy_mm in places]
+    (found,) = adjust_marks(project, moved).explanations
+    assert re.search(
+        r"right of x = 1[45][\d.]* px are displaced .* by \(\+0\.3\d*, \+0\.(18|19|2)\d*\) .* px", found.cause
+    )
+
+
 def test_a_lens_that_does_not_suit_at_all_is_adjusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its errors of more than 2 % of the marks' extent were refused as a wrong unit, before a fisheye was tried."""
     monkeypatch.setattr("adjust.solution.adjustment._drop_contradicting", lambda network, first, *_: first)
