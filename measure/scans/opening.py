@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from measure.errors import MeasurementError, MissingError
+from measure.scans.bmp_and_pnm import BMP_START, PNM_STARTS, open_plain, plain_form
 from measure.scans.cache import LostPart, OpenedPicture, Segments, WholePicture
 from measure.scans.jpeg import (
     BLOCK_PX,
@@ -20,7 +21,7 @@ from measure.scans.jpeg import (
     jpeg_pitch,
     open_jpeg,
 )
-from measure.scans.metadata import DECODING_ERRORS, PictureForm, Pitch, Samples, damage_error
+from measure.scans.metadata import DECODING_ERRORS, NO_TAGS, PictureForm, Pitch, Samples, damage_error
 from measure.scans.parallel import map_in_threads
 from measure.scans.png_and_jpeg2000 import (
     JPEG2000_END,
@@ -47,6 +48,7 @@ _OPENERS = {
     JPEG_START: open_jpeg,
     PNG_START: open_png,
     **dict.fromkeys(JPEG2000_STARTS, open_jpeg2000),
+    **dict.fromkeys((BMP_START, *PNM_STARTS), open_plain),
 }
 _HEADERS_BYTES = 1 << 18  # head of a JPEG or PNG file: profiles and Exif blocks are smaller
 _END_BYTES = 1 << 16  # end of a complete JPEG or PNG file, which holds the end marker
@@ -55,7 +57,8 @@ _FULL_SCALE_DN = 65535.0  # of a thumbnail of 16 bits
 
 
 def open_scan(path: str | Path, max_pixels: int | None = None) -> Scan:
-    """Open a TIFF, BigTIFF, JPEG, JPEG 2000 or PNG file. The format is taken from its first bytes, not from its name.
+    """Open a TIFF, BigTIFF, JPEG, JPEG 2000, PNG, BMP, PGM or PPM file. The format is taken from its first bytes, not
+    from its name.
 
     Parameters
     ----------
@@ -104,8 +107,8 @@ def _file_start(path: Path) -> bytes:
     start = next((start for start in _OPENERS if begin.startswith(start)), None)
     if start is None:
         raise MeasurementError(
-            f"{path} is no TIFF, JPEG, JPEG 2000 or PNG picture (it begins with {begin[:8]!r}): give the scan itself, "
-            "or convert it"
+            f"{path} is no TIFF, JPEG, JPEG 2000, PNG, BMP, PGM or PPM picture (it begins with {begin[:8]!r}): give "
+            "the scan itself, or convert it"
         )
     return start
 
@@ -116,8 +119,8 @@ def _reading_error(path: Path, error: OSError) -> MeasurementError:
 
 @dataclass(frozen=True)
 class ScanHead:
-    """Head of a scan file. file_format: TIFF, JPEG, JPEG 2000 or PNG; bits: per sample; notes: one sentence each;
-    camera: digital camera of the Exif block, "" for a scan."""
+    """Head of a scan file. file_format: TIFF, JPEG, JPEG 2000, PNG, BMP or PNM; bits: per sample; notes: one sentence
+    each; camera: digital camera of the Exif block, "" for a scan."""
 
     file_format: str
     width_px: int
@@ -162,6 +165,10 @@ def read_head(path: Path, max_pixels: int | None = None) -> ScanHead:
         file_format, form, marker, pitch = "JPEG", jpeg_form(data), JPEG_END, jpeg_pitch(data)
     elif start in JPEG2000_STARTS:
         file_format, form, marker, pitch = "JPEG 2000", jpeg2000_form(data), JPEG2000_END, jpeg2000_pitch(data)
+    elif start in (BMP_START, *PNM_STARTS):
+        plain = plain_form(data)
+        file_format, form, marker = "BMP" if start == BMP_START else "PNM", plain, b""
+        pitch = plain.pitch if plain else NO_TAGS
     else:
         file_format, form, marker, pitch = "PNG", png_form(data), PNG_END, png_pitch(data)
     if form is None or 0 in (form.width_px, form.height_px, form.channels, form.bits):
@@ -182,6 +189,8 @@ def declared_tone(path: Path) -> Tone | None:
             return tone_of_tags(tiff_colour_tags(path))
         if start.startswith(JPEG2000_STARTS):
             return tone_of_tags(jpeg2000_colour_tags(path))
+        if start.startswith((BMP_START, *PNM_STARTS)):
+            return None
         return tone_of_tags(png_colour_tags(path) if start.startswith(PNG_START) else jpeg_colour_tags(path))
     except (*DECODING_ERRORS, zlib.error):
         return None

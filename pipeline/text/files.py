@@ -188,7 +188,7 @@ def no_such_file(path: Path) -> str:
     return f"{path}: there is no such file{searched}.{meant}"
 
 
-SCAN_ENDINGS = (".tif", ".tiff", ".jpg", ".jpeg", ".jp2", ".j2k", ".png")
+SCAN_ENDINGS = (".tif", ".tiff", ".jpg", ".jpeg", ".jp2", ".j2k", ".png", ".bmp", ".pgm", ".ppm")
 
 
 def image_name(text: str) -> str:

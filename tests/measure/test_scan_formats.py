@@ -490,7 +490,7 @@ def zeros_png(side: int, bits: int = 8) -> bytes:
         (lambda path: path.symlink_to(path), "cannot be read"),
         (
             lambda path: path.write_text("These are my notes on the scans."),
-            r"s\.tif is no TIFF, JPEG, JPEG 2000 or PNG.*These ar",
+            r"s\.tif is no TIFF, JPEG, JPEG 2000, PNG, BMP.*These ar",
         ),
         (os.mkfifo, "no regular file, but a pipe or a device"),
     ],
@@ -672,3 +672,40 @@ def test_unsupported_kinds_are_named(tmp_path: Path, values: Any, options: dict[
     tifffile.imwrite(tmp_path / "s.tif", values, **options)
     with pytest.raises(MeasurementError, match=rf"kind that is not read \(.*{words}.*save it as grey or RGB"):
         open_scan(tmp_path / "s.tif")
+
+
+def bmp(picture: NDArray[np.uint8], bits: int) -> bytes:
+    """Rows from below, of blue, green and red or of an index into grey values, each filled up to four bytes."""
+    height, width = picture.shape[:2]
+    palette = bytes(value for grey in range(256) for value in (grey, grey, grey, 0)) if bits == 8 else b""
+    stored = picture[..., ::-1] if bits == 24 else picture
+    rows = b"".join(row.tobytes() + bytes(-row.nbytes % 4) for row in stored[::-1])
+    head = struct.pack("<IiiHHIIiiII", 40, width, height, 1, bits, 0, len(rows), 0, 0, 0, 0)
+    offset = 14 + len(head) + len(palette)
+    return b"BM" + struct.pack("<IHHI", offset + len(rows), 0, 0, offset) + head + palette + rows
+
+
+@pytest.mark.parametrize("kind", ["BMP of 8 bits", "BMP of 24 bits", "PGM of 8 bits", "PGM of 12 bits", "PPM"])
+def test_pictures_of_machine_vision_cameras(kind: str, tmp_path: Path) -> None:
+    """Nine columns: rows of a BMP are filled up to twelve bytes. A PGM of more than 8 bits is big-endian."""
+    rng, path = np.random.default_rng(1), tmp_path / "picture"
+    largest = 4095 if "12" in kind else 255
+    picture = rng.integers(0, largest, (7, 9, 3) if "24" in kind or kind == "PPM" else (7, 9), endpoint=True)
+    if kind.startswith("BMP"):
+        data = bmp(picture.astype(np.uint8), 24 if "24" in kind else 8)
+    else:
+        number = b"P6" if kind == "PPM" else b"P5"
+        data = number + b"\n# a comment\n9 7\n%d\n" % largest
+        data += picture.astype(">u2" if "12" in kind else "u1").tobytes()
+    path.write_bytes(data)
+    head = read_head(path)
+    assert (head.width_px, head.height_px, head.bits) == (9, 7, 12 if "12" in kind else 8)
+    with open_scan(path) as scan:
+        assert scan.full_scale_dn == largest
+        np.testing.assert_array_equal(scan.samples(0, 0, 9, 7).squeeze(), picture)
+    path.write_bytes(data[:-1])
+    with pytest.raises(MeasurementError, match="cut short"):
+        open_scan(path)
+    path.write_bytes(bmp(np.zeros((7, 9), np.uint8), 4))
+    with pytest.raises(MeasurementError, match="a BMP of 4 bits a pixel: save it with 8 or 24"):
+        open_scan(path)
