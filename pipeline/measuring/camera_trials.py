@@ -1,7 +1,7 @@
 """Identification of the camera of a scan: every camera with drawn marks is tried, at reduced size."""
 
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -15,6 +15,7 @@ from measure.fiducials.camera_recognition import LayoutSearch, Tried, boldest, l
 from measure.fiducials.measure_frame import Frame
 from measure.fiducials.measurement import coarseness
 from measure.fiducials.options import FiducialOptions
+from measure.fiducials.search import is_lattice
 from measure.flags import MAX_FALSE_CAMERAS
 from measure.geometry import linear_scale
 from measure.marks.shapes import FiducialLayout, finest_detail_mm, is_made_of_areas, limit_to_frame
@@ -41,6 +42,7 @@ Names = tuple[str, ...]
 _PICTURE_PX = 2400  # px, size of the measured image: for aerial film 0.1 mm per pixel, enough to read plates
 _FEW = 3  # best results of the search without a pitch, to be refined at the pitch that each found
 _BY_CHANCE = 1.0  # expected false alarms: the constellation may be one
+_MOST_FOUND = 0.5  # fraction of a lattice's marks: with more of them found, other layouts need not be tried
 _HOPELESS = 100.0  # expected false alarms: above it, the marks are not measured
 _ODDS = 1000.0  # ratio of the expected false alarms of two layouts: the rarer one is present, the other is not
 _AFFINE = 6  # parameters of an affine transformation
@@ -78,7 +80,7 @@ def identify(
         trials, tries, is_negative = list[Trial](), dict[Names, Tried](), False
         for attempt in _attempts(search, layouts, _layouts_like(layouts, likely), pitch, count):
             tried = _trials(search, attempt.tries, count)
-            ends = any(trial.stands_out and trial.expected <= attempt.most for trial in tried)
+            ends = attempt.is_last(tried)
             if ends or not attempt.is_negative:
                 trials, tries, is_negative = tried, attempt.tries, attempt.is_negative
             if ends:
@@ -159,11 +161,17 @@ def _alike_in_scan(
 
 @dataclass(frozen=True)
 class _Attempt:
-    """Tries of some layouts, and the largest expected number of false alarms for which one of them ends the search."""
+    """Tries of some layouts; the largest expected number of false alarms and the least fraction of marks found for
+    which one of them ends the search."""
 
     tries: dict[Names, Tried]
     most: float = np.inf
+    least_found: float = 0.0
     is_negative: bool = False
+
+    def is_last(self, trials: Iterable[Trial]) -> bool:
+        standing = [trial for trial in trials if trial.stands_out and trial.expected <= self.most]
+        return any(trial.found >= self.least_found * trial.drawn for trial in standing)
 
 
 def _attempts(
@@ -174,11 +182,13 @@ def _attempts(
     count: Count,
 ) -> Iterator[_Attempt]:
     """Yield tries of likely layouts, then of all at the given pitch, with non-square pixels, at any pitch and as a
-    negative shows them."""
+    negative shows them. At any pitch lattices come first: no other layout is in a scan that shows most of one."""
+    lattices = {names: layout for names, layout in layouts.items() if is_lattice(layout)}
     negatives = {names: layout.negative for names, layout in layouts.items()}
     if pitch_um is None:
         if likely:
             yield _Attempt(_any_pitch_tries(search, likely, count), MAX_FALSE_CAMERAS)
+        yield from _lattice_attempts(_any_pitch_tries(search, lattices, count))
         yield _Attempt(_any_pitch_tries(search, layouts, count))
         yield _Attempt(_any_pitch_tries(search, negatives, count), MAX_FALSE_CAMERAS, is_negative=True)
         return
@@ -187,11 +197,18 @@ def _attempts(
         given = _each(some, at_given, count)
         if any(each.answer.expected <= MAX_FALSE_CAMERAS for each in given.values()):
             yield _Attempt(given, most)
+    yield from _lattice_attempts(_any_pitch_tries(search, lattices, count))
     stretched = _each(layouts, partial(at_given, stretches=_STRETCHES), count)
     pairs = {names: (each, stretched[names]) for names, each in given.items()}
     yield _Attempt({names: min(pair, key=lambda each: each.answer.expected) for names, pair in pairs.items()})
     yield _Attempt(_any_pitch_tries(search, layouts, count))
     yield _Attempt(_each(negatives, at_given, count), MAX_FALSE_CAMERAS, is_negative=True)
+
+
+def _lattice_attempts(tries: dict[Names, Tried]) -> Iterator[_Attempt]:
+    """Yield tries of lattices at any pitch if one of them is significant."""
+    if any(each.answer.expected <= MAX_FALSE_CAMERAS for each in tries.values()):
+        yield _Attempt(tries, MAX_FALSE_CAMERAS, least_found=_MOST_FOUND)
 
 
 def _each(

@@ -6,11 +6,11 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -24,11 +24,12 @@ from real_data import DATA, needs
 from studies import parametrize_with_studies
 from truth_comparison import compare_frames
 
-from measure import FiducialOptions, measure_fiducials, open_scan
+from measure import FiducialOptions, Scan, measure_fiducials, open_scan
+from measure.fiducials.camera_recognition import CameraResponse, LayoutSearch, Tried
 from measure.fiducials.measurement import Coarseness
 from measure.flags import Code
 from measure.marks.rendering import known_picture
-from measure.marks.shapes import Mark, MarkShape, Polygon
+from measure.marks.shapes import FiducialLayout, Mark, MarkShape, Polygon
 from measure.scans.metadata import Pitch
 from measure.scans.opening import ScanHead, read_head
 from pipeline import read_project, stages
@@ -37,7 +38,7 @@ from pipeline.files import library
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.library import library_names, library_path, read_library
 from pipeline.measuring.camera_identification import Identification, Trial, drawn_alike
-from pipeline.measuring.camera_trials import _alike, identify
+from pipeline.measuring.camera_trials import _alike, _attempts, identify
 from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import render_project
 
@@ -482,6 +483,37 @@ def test_marks_of_unknown_shape_are_learned_and_not_from_one_scan_alone(frame: P
 
 def trial(cameras: tuple[str, ...], score: float, chance: float | None = 0.0) -> Trial:
     return Trial(cameras, 4, 4, 0.9, 10.0, score, chance, 1.0, 0.01, "", 2.0, 1e-6)
+
+
+@dataclass
+class FakeSearch:
+    """Search whose expected numbers of false alarms are given, by the number of marks of a layout."""
+
+    expected: Mapping[int, float]
+    tried: list[int] = field(default_factory=list)
+
+    def try_any_pitch(self, layout: FiducialLayout) -> Tried:
+        self.tried.append(len(layout.marks))
+        answer = CameraResponse(self.expected.get(len(layout.marks), np.inf), ())
+        return Tried(layout, layout, cast(Scan, None), [], 0, answer)
+
+    def refine(self, tried: Tried) -> Tried:
+        return tried
+
+
+def test_without_a_pitch_lattices_come_first_and_end_the_search_if_most_of_one_is_found() -> None:
+    layouts = {names: LIBRARY[names[0]].layout() for names in _alike(LIBRARY)}
+    search = FakeSearch({25: 1e-4, 9: 0.5})  # the réseau's 25 crosses, the register glass's nine
+    attempts = _attempts(cast(LayoutSearch, search), layouts, {}, None, no_count)
+    first = next(attempts)
+    assert {*search.tried} == {25, 9}
+    standing = trial(("hasselblad-reseau-60",), 0.3)
+    assert first.is_last([replace(standing, found=13, drawn=25)])
+    assert not first.is_last([replace(standing, found=12, drawn=25)])
+    assert not first.is_last([replace(standing, found=13, drawn=25, expected=0.02)])
+    assert next(attempts).tries.keys() == layouts.keys()
+    faint = FakeSearch({25: 0.02})
+    assert next(_attempts(cast(LayoutSearch, faint), layouts, {}, None, no_count)).tries.keys() == layouts.keys()
 
 
 def test_marks_finer_than_the_pixels_are_not_those_of_a_camera(tmp_path: Path) -> None:
