@@ -399,9 +399,13 @@ def test_a_negative_whose_pitch_is_wrong_is_searched_for_where_it_fills_the_scan
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     listed = list[Stage]()
-    monkeypatch.setattr(stages, "_find_in_stages", lambda *given: listed.extend(given[2]) or StageResult())
+
+    def record(_scan: Scan, _layout: FiducialLayout, tried: Sequence[Stage], _options: FiducialOptions) -> StageResult:
+        listed[:] = tried
+        return StageResult()
+
+    monkeypatch.setattr(stages, "_find_in_stages", record)
     for pitch_mm in (1 / PX_PER_MM, 4 / PX_PER_MM):
-        listed.clear()
         stages.find_in_negative(make_scan(picture(DOTS, "0")), DOTS, (1000 * pitch_mm,) * 2, OPTIONS)
         ratios = [each.mm[0] * PX_PER_MM for stage in listed for each in stage.hypotheses]
         assert any(abs(ratio - 1) < 0.1 for ratio in ratios)
