@@ -15,7 +15,7 @@ import numpy as np
 import compiled
 from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.correction import Imaged
-from adjust.functional_model.lens import Lens
+from adjust.functional_model.lens import ImageEquations, Lens
 from adjust.functional_model.projection import SightVectors, rays, sight_vectors
 from adjust.linear_algebra.small_matrices import applied, columns, cross, laid_out, product, take_members, zeros
 from adjust.problem.problem import Part, Problem, State
@@ -83,11 +83,13 @@ def _computed_in_camera(problem: Problem, state: State, targets: Iterable[Target
         lens = _lens(problem, state, shown.camera)
         if lens.interior[0] <= 0.0:
             return None
+        displaced_mm = image_displacements(problem, state, shown.rows) if problem.network.boards else np.zeros(2)
         if problem.by_elements:
-            at = lens.equations_with_image(observed[shown.rows], shown.imaged)
+            at = lens.equations_with_image(observed[shown.rows] - displaced_mm, shown.imaged)
             xy_mm, found = observed[shown.rows] - at.value, np.isfinite(at.value).all(axis=1)
         else:
             xy_mm, found = lens.camera_from_image(shown.imaged)
+            xy_mm = xy_mm + displaced_mm
         if not (found & (shown.in_camera[:, 2] < 0.0)).all():
             return None
         camera_xy[shown.rows] = xy_mm
@@ -114,7 +116,7 @@ def _sight(problem: Problem, state: State, rows: Rows) -> SightVectors:
     points = state.values[problem.places.T[:, rows]].T
     if problem.network.boards:
         bends = state.values[problem.board_positions[rows]]  # arbitrary for points on no board: their lift is 0
-        points = points + (bends[:, :, None] * problem.lift_directions[rows]).sum(axis=1)
+        points = points + (bends[:, :, None] * problem.board_directions[rows, :, :3]).sum(axis=1)
     return sight_vectors(problem.network.line_of_sight, stations, points)
 
 
@@ -146,21 +148,24 @@ def _straight(problem: Problem, state: State, xy_mm: Array) -> Array:
     return straight_mm
 
 
-def object_displacements(problem: Problem, state: State, camera_xy: Array, image_mm: Array) -> Array:
-    """(n, k, 3) displacements of the targets' points, parallel to the image, that displace their images at (n, 2) by
-    (n, k, 2) mm in the camera frame, but for what free parameters of the camera displace."""
-    found = np.zeros((*image_mm.shape[:2], 3))
-    for name, rows in problem.targets_by_camera.items():
-        shown = _image_targets(problem, state, name, rows)
-        at = _lens(problem, state, name).equations_with_image(camera_xy[rows], shown.imaged)
-        misclosure = at.xy_jacobian @ image_mm[rows].swapaxes(1, 2)
-        is_free = problem.unknowns.sigma[problem.unknowns.camera[name]] > 0.0
-        by_free = at.quantity_jacobian[..., is_free].reshape(misclosure[..., 0].size, -1)
-        flat = misclosure.reshape(-1, misclosure.shape[2])
-        rest = (flat - by_free @ np.linalg.lstsq(by_free, flat)[0]).reshape(misclosure.shape)
-        in_plane = (np.linalg.solve(at.ray_jacobian, rest) * shown.in_camera[:, 2, None, None]).swapaxes(1, 2)
-        found[rows] = in_plane @ state.rotations[problem.image_numbers[rows], :2]
-    return found
+def image_displacements(problem: Problem, state: State, rows: Rows) -> Array:
+    """(n, 2) mm, displacements of the images of some targets in the camera frame."""
+    values = state.values[problem.board_positions[rows]]
+    return np.asarray((values[:, :, None] * problem.board_directions[rows, :, 3:]).sum(axis=1))
+
+
+def beside_lens(problem: Problem, state: State, computed_mm: Array, camera: str, image_mm: Array) -> Array:
+    """Displacements (n, k, 2) of a camera's images but for what its parameters that are not fixed displace."""
+    rows = problem.targets_by_camera[camera]
+    shown = _image_targets(problem, state, camera, rows)
+    places = camera_places(problem, state, computed_mm)[rows] - image_displacements(problem, state, rows)
+    at = _lens(problem, state, camera).equations_with_image(places, shown.imaged)
+    by_camera = np.linalg.solve(at.xy_jacobian, at.quantity_jacobian)
+    by_camera = by_camera[..., problem.unknowns.sigma[problem.unknowns.camera[camera]] > 0.0].reshape(2 * len(rows), -1)
+    flat, rest = image_mm[rows].swapaxes(1, 2).reshape(2 * len(rows), -1), image_mm.copy()
+    flat = flat - by_camera @ np.linalg.lstsq(by_camera, flat)[0]
+    rest[rows] = flat.reshape(len(rows), 2, -1).swapaxes(1, 2)
+    return rest
 
 
 def _computed_in_comparator(problem: Problem, state: State, camera_xy: Array) -> tuple[Array, Mask]:
@@ -193,7 +198,8 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
     for shown in computed.targets:
         lens = _lens(problem, state, shown.camera)
         images, rows = problem.image_numbers[shown.rows], shown.rows
-        at = lens.equations_with_image(at_distorted.camera_xy[rows], shown.imaged)
+        displaced_mm = image_displacements(problem, state, rows) if problem.network.boards else 0.0
+        at = lens.equations_with_image(at_distorted.camera_xy[rows] - displaced_mm, shown.imaged)
         if len(at.value) == len(xy_mm):
             by_camera_xy = at.xy_jacobian
         else:
@@ -210,7 +216,7 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
                 np.array([parts.camera.columns.start]), by_unknowns,
             )  # fmt: skip
         else:
-            _fill_targets(by_unknowns, problem, state, shown, at.ray_jacobian)
+            _fill_targets(by_unknowns, problem, state, shown, at)
             _fill(by_unknowns, rows, parts.camera, by_camera.swapaxes(1, 2))
     for part, of_film, of_distorted in (
         (parts.film, film.parameter_jacobian, at_distorted.parameter_jacobian),
@@ -224,11 +230,11 @@ def derivatives(problem: Problem, state: State, computed: Computed) -> Derivativ
     return Derivatives(product(by_camera_xy, film.xy_jacobian) if has_films else by_camera_xy, by_unknowns)
 
 
-def _fill_targets(by_unknowns: Array, problem: Problem, state: State, shown: TargetImages, by_ray: Array) -> None:
-    """Fill the columns of exterior orientation, points and boards from the derivatives (n, 2, 2) w.r.t. the ray."""
+def _fill_targets(by_unknowns: Array, problem: Problem, state: State, shown: TargetImages, at: ImageEquations) -> None:
+    """Fill the columns of exterior orientation, points and boards from the derivatives of the condition equations."""
     parts, rows, straight = problem.parts, shown.rows, problem.network.line_of_sight.is_straight
     images = problem.image_numbers[rows]
-    by_in_plane = by_ray / -shown.in_camera[:, 2, None, None]  # the ray is -U/W, -V/W
+    by_in_plane = at.ray_jacobian / -shown.in_camera[:, 2, None, None]  # the ray is -U/W, -V/W
     by_in_camera = columns([by_in_plane[..., 0], by_in_plane[..., 1], applied(by_in_plane, shown.ray)])
     by_vector = product(by_in_camera, take_members(state.rotations, images))
     by_attitude = cross(shown.in_camera[:, None, :], by_in_camera)
@@ -242,7 +248,10 @@ def _fill_targets(by_unknowns: Array, problem: Problem, state: State, shown: Tar
     by_exterior = by_station, by_attitude
     _fill(by_unknowns, rows, parts.exterior, [by_exterior[k // 3][..., k % 3] for k in parts.exterior.members])
     _fill(by_unknowns, rows, parts.place, [by_point[..., k] for k in parts.place.members])
-    by_boards = [applied(by_point, problem.lift_directions[rows, k]) for k in parts.board.members]
+    boards = problem.board_directions[rows]
+    by_boards = [
+        applied(by_point, boards[:, k, :3]) - applied(at.xy_jacobian, boards[:, k, 3:]) for k in parts.board.members
+    ]
     _fill(by_unknowns, rows, parts.board, by_boards)
 
 

@@ -152,8 +152,8 @@ class Board:
     """Flat board with a bend, which displaces its points from the plane, or any other displacement of points.
 
     places: undeformed coordinates (3,) of all its points by id, including those in no image. bends: priors of the
-    parameters, bend_x and bend_y in object units. by_observation (n, k, 3): displacements of the point of each target
-    by parameters of 1 that take the place of the bend.
+    parameters, bend_x and bend_y in object units. by_observation: displacements (n, k, 3) of the point of each target,
+    or (n, k, 2) of its image in the camera frame, mm, by parameters of 1 that take the place of the bend.
     """
 
     name: str

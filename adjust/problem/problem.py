@@ -287,19 +287,21 @@ class Problem:
         return positions
 
     @cached_property
-    def lift_directions(self) -> Array:
-        """(n, k, 3) displacement of the point by each parameter of its boards of 1; 0 where there is none."""
+    def board_directions(self) -> Array:
+        """(n, k, 5) displacement of the point, and of its image in the camera frame in mm, by each parameter of its
+        boards of 1; 0 where there is none."""
         names, of_name = self.network.observations.numbered_points
-        lifted = np.zeros((*self.board_positions.shape, 3))
+        found = np.zeros((*self.board_positions.shape, 5))
         for board in self.network.boards:
             row, column = np.nonzero(self.board_positions == self.unknowns.board[board.name][0])
             if board.by_observation is not None:
                 directions = board.by_observation[row]
             else:
                 directions = np.array([board.lift_directions[names[i]] for i in of_name[row]])
+            members = slice(0, 3) if directions.shape[2] == 3 else slice(3, 5)
             for k in range(len(board.bends)):
-                lifted[row, column + k] = directions[:, k]
-        return lifted
+                found[row, column + k, members] = directions[:, k]
+        return found
 
     @cached_property
     def columns(self) -> Indices:

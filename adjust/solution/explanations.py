@@ -25,6 +25,7 @@ principal distances of their own have to scatter more than principal points.
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, product
@@ -34,6 +35,7 @@ from scipy.spatial import KDTree
 from scipy.special import chdtr, chdtrc, fdtrc, ndtr
 
 from adjust.array_types import Array, Indices, Mask
+from adjust.errors import NoImageError
 from adjust.functional_model.distortion_models import UM_PER_MM
 from adjust.problem.problem import Problem
 from adjust.quality.cofactor import free_cofactor
@@ -44,7 +46,7 @@ from adjust.quality.variance_components import added_variance, refined_factors
 from adjust.rank_defect.diagnosis import singular_directions
 from adjust.solution.model_hypotheses import Estimate, ModelHypothesis, continue_problem, model_hypotheses
 from adjust.solution.point_hypotheses import point_hypotheses, wrong_points
-from adjust.solution.reweighting import again
+from adjust.solution.reweighting import again, without
 
 LEVEL = 0.001  # probability of reporting anything where the model is correct
 SUSPECTED = 0.05  # p-value of v'Pv below which wrong points are sought
@@ -57,6 +59,7 @@ WORTH = 0.3  # fraction of the largest first-order decrease above which a hypoth
 STEPS = 40  # images of another pitch need about 20
 LEAST_SHARE = 0.05  # of v'Pv; further lens terms remove up to 0.02 on real boards
 FREED = 1e6  # factor on variances at first that leave the given points no redundancy
+SETTLED = 1.0  # fall of v'Pv below which displacements need not be found anew: as small as the noise of one residual
 TURNS = 8  # adjustments, each with the variance of the one before
 ENDING = ("groups", "distances", "affinities")  # after which nothing else is sought
 OF_IMAGES = ("radial", "decentering", "bow", "pixels", "shear", "drift", "jump", "interior", "groups", "distances")
@@ -100,30 +103,8 @@ def explain(
     """
     if not run.converged or redundancy < CHECKED:
         return (), run
-    first = last = before = _Model(run, redundancy, probabilities, unmodelled)
-    found: list[Explanation] = []
-    for _ in range(ROUNDS):
-        if found and (not last.exceeds(probabilities.family) or last.leaves_second_order(first)):
-            break
-        alike, has_rival = _best(last)
-        if len(alike) == 1 and alike[0].hypothesis:
-            points = wrong_points(last.hypothesis, alike[0].hypothesis, alike[0].run)
-            # Estimates of the round before are spoilt by the points that were not yet found.
-            if last.kind == points.kind == "point" and not points.selection.words:
-                found.pop()
-            else:
-                before = last
-            alike = [replace(alike[0], hypothesis=points)]
-        else:
-            before = last
-        found += [_model_explanation(each, before) for each in alike]
-        if not alike or has_rival:
-            break
-        last = alike[0]
-        if len(alike) == 1 and last.kind == "groups":
-            last = _separate_lenses(last) or last
-        if len(alike) > 1 or last.kind in ENDING:
-            break
+    first = _Model(run, redundancy, probabilities, unmodelled)
+    found, last = _forward(first)
     is_noise = last.exceeds(LEVEL) and not last.leaves_second_order(first)
     noises = (_added_noise(last.run, last.redundancy), _wide_control(last.run)) if is_noise else ()
     for words, with_noise, widened in filter(None, noises):
@@ -132,8 +113,36 @@ def explain(
             found.append(_explanation("noise", words, float(chdtrc(last.redundancy, last.vpv)), last, noisy))
             last = noisy
             break
-    explains = not last.exceeds(LEVEL) or last.variance - 1.0 < LEFT * (first.variance - 1.0)
+    left = last.rest[0] / last.rest[1]
+    explains = not last.exceeds(LEVEL) or left - 1.0 < LEFT * (first.variance - 1.0)
     return (tuple(found), last.run) if found and explains else ((), run)
+
+
+def _forward(first: "_Model") -> tuple[list[Explanation], "_Model"]:
+    """Add the best hypothesis, and again on what it leaves; also return the model with all."""
+    last = before = first
+    found = list[Explanation]()
+    for _ in range(ROUNDS):
+        if found and (not last.exceeds(first.probabilities.family) or last.leaves_second_order(first)):
+            break
+        base, alike, has_rival = _best_of_bases(last)
+        earlier, before = before, base
+        if len(alike) == 1 and alike[0].hypothesis:
+            points = wrong_points(last.hypothesis, alike[0].hypothesis, alike[0].run)
+            # Estimates of the round before are spoilt by the points that were not yet found.
+            if last.kind == points.kind == "point" and not points.selection.words:
+                found.pop()
+                before = earlier
+            alike = [replace(alike[0], hypothesis=points)]
+        found += [_model_explanation(each, before) for each in alike]
+        if not alike or has_rival:
+            break
+        last = alike[0].with_gross_errors(first.run)
+        if len(alike) == 1 and last.kind == "groups":
+            last = _separate_lenses(last) or last
+        if len(alike) > 1 or last.kind in ENDING:
+            break
+    return found, last
 
 
 @dataclass(frozen=True)
@@ -182,9 +191,28 @@ class _Model:
         units = [each.unit for each in self.gross_errors]
         return self._snooping.rest(units) if units else (self.vpv, float(self.redundancy))
 
-    def criterion(self, variance: float) -> float:
-        """v'Pv over a variance without gross errors, plus the cost of removing and choosing these."""
-        vpv, redundancy = self.rest
+    @cached_property
+    def clean(self) -> "_Model | None":
+        """The model adjusted without its gross errors; None where there are none, or without a solution."""
+        units = [each.unit for each in self.gross_errors]
+        run = without(self.run, units) if units else None
+        return replace(self, run=run, redundancy=round(self.rest[1])) if run and run.converged else None
+
+    def with_gross_errors(self, first: Run) -> "_Model":
+        """The model adjusted with the weights of a first run, and its gross errors sought."""
+        given, weighting = replace(self, has_suspects=True), first.weighting
+        if not self.run.weighting.differs(weighting):
+            return given
+        run = again(self.run, weighting, STEPS)
+        regained = int(first.units.sizes[weighting.used & ~self.run.weighting.used].sum())
+        return replace(given, run=run, redundancy=self.redundancy + regained) if run.converged else given
+
+    def criterion(self, variance: float, rest: tuple[float, float] | None = None) -> float:
+        """v'Pv over a variance without gross errors, plus the cost of removing and choosing these.
+
+        rest: v'Pv and redundancy without them, where these are known better than in the linear model.
+        """
+        vpv, redundancy = rest or self.rest
         chosen_from = len(self.gross_errors) * float(np.log(len(self.run.units)))
         return vpv / variance + 2.0 * (self.redundancy - redundancy + chosen_from)
 
@@ -226,15 +254,29 @@ class _Model:
 
     def adjust(self, problem: Problem) -> Run | None:
         """Adjust a larger problem from its start with the same weights; None without a solution."""
-        larger = again(replace(self.run, problem=problem), self.run.weighting, STEPS, problem.start())
-        return larger if larger.converged else None
+        with suppress(NoImageError):
+            larger = again(replace(self.run, problem=problem), self.run.weighting, STEPS, problem.start())
+            return larger if larger.converged else None
+        return None
+
+    def _adjust_anew(self, hypothesis: ModelHypothesis) -> Run | None:
+        """Adjust with a hypothesis, linearised anew where that led until v'Pv stands still; None without a solution."""
+        run = self.adjust(hypothesis.problem)
+        for _ in range(TURNS if hypothesis.anew else 0):
+            if run is None or hypothesis.anew is None:
+                break
+            anew = self.adjust(hypothesis.anew(run))
+            if anew is None or anew.end.vpv > run.end.vpv - SETTLED:
+                break
+            run = anew
+        return run
 
     def extend(self, hypothesis: ModelHypothesis, level: float) -> "_Model | None":
         """Add a hypothesis to the model; None without a solution within its limits, or where it is not significant.
 
         It is tested by the actual decrease of v'Pv, and beside gross errors that it leaves also without them.
         """
-        run, (low, high) = self.adjust(hypothesis.problem), hypothesis.limits
+        run, (low, high) = self._adjust_anew(hypothesis), hypothesis.limits
         values = None if run is None else run.end.state.values[hypothesis.added]
         if run is None or values is None or not ((values >= low) & (values <= high)).all():
             return None
@@ -246,6 +288,20 @@ class _Model:
         larger = _Model(run, left, self.probabilities, self.unmodelled, has_suspects, hypothesis, p)
         is_rid = not self.gross_errors or len(larger.gross_errors) < len(self.gross_errors)
         return larger if is_rid or self.probability(hypothesis, self.rest[0] - larger.rest[0]) < level else None
+
+
+def _best_of_bases(model: _Model) -> tuple[_Model, list[_Model], bool]:
+    """The model, or that without its gross errors, with the hypotheses that are best beside those that remain.
+
+    Gross errors hide what a model lacks, and what it lacks looks like gross errors.
+    """
+    bases = (model,) if model.clean is None else (model, model.clean)
+    found = [(base, *_best(base)) for base in bases]
+    best = [alike[0].with_gross_errors(model.run) for _, alike, _ in found if alike]
+    if len(best) < 2:
+        return next((each for each in found if each[1]), found[0])
+    variance = max(1.0, min(each.rest[0] / each.rest[1] for each in best))
+    return found[int(np.argmin([each.criterion(variance) + each.costs for each in best]))]
 
 
 def _best(model: _Model) -> tuple[list[_Model], bool]:
@@ -268,15 +324,17 @@ def _best(model: _Model) -> tuple[list[_Model], bool]:
     found = [each for each in candidates if each is not None]
     if not found:
         return [], False
-    variance = max(1.0, min(each.rest[0] / each.rest[1] for each in (model, *found)))
+    # In the linear model a large gross error leaves its second order.
+    rest = (model.clean.vpv, float(model.clean.redundancy)) if model.clean else model.rest
+    variance = max(1.0, min(vpv / redundancy for vpv, redundancy in (rest, *(each.rest for each in found))))
     for general, special in GENERAL.items():
         found = _drop_nested(found, variance, general, special)
     criteria = [each.criterion(variance) + each.costs for each in found]
-    without = model.criterion(variance) - min(criteria) if model.gross_errors else np.inf
-    if without < -DECISIVE:
+    rival = model.criterion(variance, rest) - min(criteria) if model.gross_errors else np.inf
+    if rival < -DECISIVE:
         return [], False
     alike = [each for each, own in zip(found, criteria, strict=True) if own < min(criteria) + DECISIVE]
-    return alike, bool(without < DECISIVE)
+    return alike, bool(rival < DECISIVE)
 
 
 def _drop_nested(found: list[_Model], variance: float, general: str, special: tuple[str, ...]) -> list[_Model]:

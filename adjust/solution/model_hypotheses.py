@@ -4,7 +4,7 @@ So one linearised step estimates the fall of v'Pv. The words of a hypothesis are
 here of the cameras (lens terms, pixels, interior orientations), and of scans and films.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adjust.array_types import Array, Indices
+from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.correction import AFFINITY_TERMS, ZERO, PolynomialTerms, Term, decentering, radial
 from adjust.functional_model.distortion_models import UM_PER_MM
 from adjust.functional_model.families import family
@@ -20,7 +20,7 @@ from adjust.functional_model.lens import INTERIOR_NAMES, Prior
 from adjust.functional_model.scanner import is_left
 from adjust.functional_model.transformation import LATTICE, film_kind, fit_transformation
 from adjust.problem.camera import Camera
-from adjust.problem.condition_equations import camera_places, object_displacements
+from adjust.problem.condition_equations import beside_lens, camera_places, image_displacements
 from adjust.problem.network import Approximations, Board, Network, Scanner, Transformation
 from adjust.problem.parameter import shortened
 from adjust.problem.problem import Problem, number
@@ -68,6 +68,7 @@ class ModelHypothesis:
     limits: tuple[float, float] = (-np.inf, np.inf)  # possible values of the unknowns
     selection: partitions.Selection = NONE
     shown: Indices | None = None  # positions of the unknowns that the words tell; all those added where None
+    anew: Callable[[Run], Problem] | None = None  # the problem linearised anew where an adjustment of it ended
 
 
 OTHERS = " (other images)"  # suffix of a camera's name for the images with a different interior orientation
@@ -93,7 +94,7 @@ def model_hypotheses(run: Run, is_suspicious: bool, is_fitted: bool) -> Iterator
 
 
 def displace_points(run: Run, name: str, kind: str, words: Words, directions: Array) -> ModelHypothesis:
-    """Add displacements (n, k, 3) of the targets' points as unknowns."""
+    """Add displacements of the targets' points (n, k, 3), or of their images (n, k, 2), as unknowns."""
     network = run.problem.network
     board = Board(name, {}, (FREE,) * directions.shape[1], directions)
     problem = continue_problem(run, replace(network, boards=(*network.boards, board)))
@@ -143,16 +144,19 @@ BOW: tuple[Term, Term] = (({(0, 2): 1.0}, ZERO), (ZERO, {(2, 0): 1.0}))
 def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     """The lowest radial terms that a camera lacks, its next decentering terms, a bow, and affinity of the pixels.
 
-    Polynomials of the observed point in units of half the frame, so that their parameters are in mm at its edge.
+    Radial and decentering terms are those of its distortion family that are held, if there are any; all others are
+    polynomials of the image point in units of half the frame, so that their parameters are in mm at its edge.
     """
     network, groups = run.problem.network, dict(family(camera.distortion.family).groups)
-    free = camera.distortion.free
+    positions, unknowns = run.problem.lens_positions(camera.name), run.problem.unknowns
+    free = {name for name, at in positions.items() if unknowns.sigma[at] > 0.0}
+    held = {group: _held_terms(camera, group, free)[:TERMS_TOGETHER] for group in ("radial", "decentering")}
     images = [image for image in network.images if image.camera == camera.name]
     half_mm = camera.distortion.half_mm[0] or max(network.extent_by_image[image.name].half_mm for image in images)
-    places = _from_principal_point(run, camera)
-    estimated = {3 + 2 * k for k, name in enumerate(groups.get("radial", ())) if name in free}
+    degree_of = {name: 3 + 2 * k for k, name in enumerate(groups.get("radial", ()))}
+    estimated = {degree for name, degree in degree_of.items() if name in free}
     degrees = [degree for degree in RADIAL_DEGREES if degree not in estimated] or RADIAL_DEGREES[-TERMS_TOGETHER:]
-    degrees = degrees[:TERMS_TOGETHER]
+    degrees = [degree_of[name] for name in held["radial"]] or degrees[:TERMS_TOGETHER]
     pattern = f"a radial pattern, of the degrees {', '.join(map(str, degrees))} in r"
     rows: list[tuple[str, Sequence[Term], Words]] = [
         ("radial", [radial((degree - 1) // 2) for degree in degrees], _too_simple_words(camera, "radial", pattern))
@@ -171,16 +175,33 @@ def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
             if not free.intersection(groups.get("affinity", ())[k : k + 1]):
                 rows.append((name, AFFINITY_TERMS[k : k + 1], words))
     for name, terms, words in rows:
-        fields = PolynomialTerms.from_terms(terms).correction(places, np.zeros(2), np.zeros(len(terms)), half_mm)
-        yield _displaced_images(run, name, name, camera, words, fields.parameter_jacobian.swapaxes(1, 2))
+        if own := held.get(name):
+            added = np.array([positions[each] for each in own])
+            yield ModelHypothesis(name, words, free_and_continue(run, added), added)
+            continue
+
+        def fields(places: Array, terms: Sequence[Term] = terms) -> Array:
+            at = PolynomialTerms.from_terms(terms).correction(places, np.zeros(2), np.zeros(len(terms)), half_mm)
+            return at.parameter_jacobian.swapaxes(1, 2)
+
+        yield _displaced_images(run, name, name, camera, words, fields)
+
+
+def _held_terms(camera: Camera, group: str, free: Collection[str]) -> list[str]:
+    """Terms of a group of the camera's distortion family that are not free."""
+    lens_family = family(camera.distortion.family)
+    # Terms of a denominator are asked for by nobody at first.
+    return [
+        name
+        for name in dict(lens_family.groups).get(group, ())
+        if name not in lens_family.alike_at_zero and name not in free
+    ]
 
 
 def _too_simple_words(camera: Camera, group: str, what: str) -> Words:
     """Words on a lens model without terms of a group; what: pattern of the residuals."""
-    lens_family, distortion = family(camera.distortion.family), camera.distortion
-    names, free = dict(lens_family.groups).get(group, ()), distortion.free
-    # Terms of a denominator are asked for by nobody at first.
-    fixed = [name for name in names if name not in {*lens_family.alike_at_zero, *free}]
+    distortion = camera.distortion
+    fixed = _held_terms(camera, group, distortion.free)
     if distortion.family == "none":
         terms = "k1 and k2" if group == "radial" else "p1 and p2"
         remedy = f'Give the camera a [distortion] of the family "brown", say, with {terms} free.'
@@ -188,8 +209,7 @@ def _too_simple_words(camera: Camera, group: str, what: str) -> Words:
         remedy = f'Free {", ".join(fixed)} under [distortion.sigma] of the camera ("free").'
     else:
         remedy = "Choose a distortion family with more terms, legendre(5) say; `reseau adjust --choose` compares some."
-    held = {name for name, prior in distortion.parameters.items() if prior.value} - free
-    wrong = [name for name in names if name in held]
+    wrong = [name for name in fixed if name in distortion.parameters and distortion.parameters[name].value]
     doubt = f", or what is given as exact, {', '.join(wrong)}, is wrong" if wrong else ""
     cause = f"The lens model of camera {camera.name} is too simple{doubt}: the residuals have {what}"
     per_mm, unit = camera.image_unit(UM_PER_MM, "µm")
@@ -272,7 +292,6 @@ def _drift(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     shown, of_row, counts = np.unique(problem.image_numbers[rows], return_inverse=True, return_counts=True)
     if len(shown) < FEWEST_DRIFTING:
         return
-    outward = _from_principal_point(run, camera) / state.values[problem.unknowns.camera[camera.name][0]]
     points = state.values[problem.places[rows]]
     middle = np.stack([np.bincount(of_row, points[:, k]) for k in range(3)], axis=1) / counts[:, None]
     nearness = 1.0 / np.linalg.norm(middle - state.values[problem.exterior[shown, :3]], axis=1)
@@ -291,29 +310,52 @@ def _drift(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
         ("nearness", nearness, "from the farthest image to the nearest"),
     ):
         if np.ptp(by) > LEAST_CHANGE * by.max():
-            share = np.zeros(len(outward))
-            share[rows] = ((by - by.mean()) / np.ptp(by))[of_row]
-            yield _displaced_images(run, name, "drift", camera, words(along), (outward * share[:, None])[:, None])
+            share = np.zeros((len(problem.image_numbers), 1, 1))
+            share[rows, 0, 0] = ((by - by.mean()) / np.ptp(by))[of_row] / (100.0 * distance)
 
+            def fields(places: Array, share: Array = share) -> Array:
+                return places[:, None] * share
 
-def _from_principal_point(run: Run, camera: Camera) -> Array:
-    """(n, 2) mm, adjusted image points of a camera relative to its principal point; 0 for other marks."""
-    problem, xy_mm = run.problem, np.zeros_like(run.end.v_mm)
-    rows = problem.targets_by_camera[camera.name]
-    principal_point = run.end.state.values[problem.unknowns.camera[camera.name][1:3]]
-    xy_mm[rows] = camera_places(problem, run.end.state, run.end.computed_mm)[rows] - principal_point
-    return xy_mm
+            yield _displaced_images(run, name, "drift", camera, words(along), fields)
 
 
 def _displaced_images(
-    run: Run, name: str, kind: str, camera: Camera, words: Words, fields_mm: Array
+    run: Run, name: str, kind: str, camera: Camera, words: Words, fields: Callable[[Array], Array]
 ) -> ModelHypothesis:
-    """Add displacements (n, k, 2) of the camera's images in mm as unknowns."""
-    camera_xy = camera_places(
-        run.problem, run.end.state, run.end.computed_mm
-    )  # observed places have the residuals' errors
-    directions = object_displacements(run.problem, run.end.state, camera_xy, fields_mm)
-    return displace_points(run, f"{name} of {camera.name}", kind, words, directions)
+    """Add displacements of the camera's images as unknowns.
+
+    fields: displacements (n, k, 2) in mm at places (n, 2) in mm from the principal point.
+    """
+    own = f"{name} of {camera.name}"
+
+    def fields_mm(last: Run) -> Array:
+        at = fields(_from_principal_point(last, camera.name))
+        # What the lens has is no part of what it lacks, even where it is given with a standard deviation.
+        is_of_lens = kind in ("radial", "decentering")
+        return beside_lens(last.problem, last.end.state, last.end.computed_mm, camera.name, at) if is_of_lens else at
+
+    def anew(last: Run) -> Problem:
+        """Take the displacements from where the images lie with them in the model."""
+        network, at = last.problem.network, fields_mm(last)
+        boards = (replace(each, by_observation=at) if each.name == own else each for each in network.boards)
+        return continue_problem(last, replace(network, boards=tuple(boards)))
+
+    return replace(displace_points(run, own, kind, words, fields_mm(run)), anew=anew)
+
+
+def _from_principal_point(run: Run, camera: str) -> Array:
+    """(n, 2) mm, adjusted image points of a camera without displacements, relative to its principal point.
+
+    They are 0 for other marks.
+    """
+    problem, state, xy_mm = run.problem, run.end.state, np.zeros_like(run.end.v_mm)
+    rows = problem.targets_by_camera[camera]
+    # Observed places have the residuals' errors.
+    camera_xy = camera_places(problem, state, run.end.computed_mm)[rows]
+    xy_mm[rows] = (
+        camera_xy - image_displacements(problem, state, rows) - state.values[problem.unknowns.camera[camera][1:3]]
+    )
+    return xy_mm
 
 
 def _scanner_pixels(run: Run) -> Iterator[ModelHypothesis]:
@@ -353,8 +395,10 @@ def _jumps(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
                 "Take or scan the picture again, or check whether it was joined from parts.",
             )
 
-        fields_mm = jump.beyond[:, None, None] * np.eye(2)
-        found = _displaced_images(run, f"jump {jump.image}", "jump", camera, words, fields_mm)
+        def fields(_: Array, beyond: Mask = jump.beyond) -> Array:
+            return np.asarray(beyond[:, None, None] * np.eye(2))
+
+        found = _displaced_images(run, f"jump {jump.image}", "jump", camera, words, fields)
         # The best of as many jumps as there are coordinates.
         yield replace(
             found, selection=partitions.Selection(choices=float(np.log(2.0 * len(rows))), contrasts=2 * len(rows))

@@ -49,7 +49,7 @@ from adjust.rank_defect.diagnosis import held_directions, inseparable
 from adjust.solution.explanations import Explanation, explain
 from adjust.solution.options import Options
 from adjust.solution.point_hypotheses import diameter_notes
-from adjust.solution.reweighting import again, run
+from adjust.solution.reweighting import again, run, without
 from adjust.solution.warnings import curved_valley_warnings, film_scale_notes, held_decentering_notes, run_warnings
 
 
@@ -246,7 +246,14 @@ class Adjustment(estimates.Estimates, PlottedResult):
         if run is not self.run:
             variance = variance_factor(run, _redundancy(run, self.cofactor))
             tested = reliability(run, variance, self.probabilities)
-        found = Snooping(run, self.probabilities).suspects(tested, round(variance.redundancy)) if tested else ()
+        search = Snooping(run, self.probabilities)
+        found = search.suspects(tested, round(variance.redundancy)) if tested else ()
+        units = [each.unit for each in search.contradictions]
+        if tested and len(units) > 1 and (clean := without(run, units)).is_tested and clean.converged:
+            # In the linear model a large gross error leaves its second order in others.
+            is_wrong = clean.statistics.statistic > Snooping(clean, self.probabilities).limits
+            agreeing = [tested.tested[unit] for unit in units if not is_wrong[unit]]
+            found = tuple(each for each in found if each.tested not in agreeing)
         is_warned = not self.coordinate_blunders or self.run.removed
         return tuple(each for each in found if is_warned or each.tested.point in self.coordinate_blunders)
 

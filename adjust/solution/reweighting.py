@@ -22,6 +22,7 @@ from adjust.rank_defect.diagnosis import REACHES, edge_motions, is_contradicted,
 from adjust.solution.options import Options
 
 ROUNDS = 30  # largest number of rounds of robust estimation, variance components or data snooping
+STEPS_WITHOUT = 40  # iterations without gross errors, which may have led far away
 ITERATIONS_A_ROUND = 8  # iterations per round of robust estimation, whose weights will change anyway
 
 
@@ -57,10 +58,10 @@ def run(
             for unit in doubted_units
         )
         last = replace(last, removed=tuple(removed))
-    last = _snoop_rounds(last, replace(options, variance_components=False))
+    last = snoop(last, replace(options, variance_components=False))
     if not options.groups:
         return last
-    return _snoop_rounds(_settle(replace(last, weighting=replace(last.weighting, factors=factors)), options), options)
+    return snoop(_settle(replace(last, weighting=replace(last.weighting, factors=factors)), options), options)
 
 
 def _settle(last: Run, options: Options, doubted: Sequence[int] = ()) -> Run:
@@ -99,7 +100,14 @@ def again(last: Run, weighting: Weighting, limit: int, state: State | None = Non
     return replace(_run(last.problem, weighting, state or last.end.state, limit), removed=last.removed)
 
 
-def _snoop_rounds(last: Run, options: Options) -> Run:
+def without(last: Run, units: Sequence[int]) -> Run:
+    """Adjust again, from the end of the last run, with its weights but without some units."""
+    weights = last.weighting.weights.copy()
+    weights[list(units)] = NO_WEIGHT
+    return again(last, replace(last.weighting, weights=weights), STEPS_WITHOUT)
+
+
+def snoop(last: Run, options: Options) -> Run:
     """Remove outliers and adjust until none remains and every removed one would be rejected again."""
     earlier: set[frozenset[int]] = set()
     for _ in range(ROUNDS):

@@ -80,13 +80,16 @@ def test_a_rotation_vector_is_the_rotation_of_other_programs(length: float) -> N
 @parametrize_with_studies(("kind", "by_elements"), list(product(nets.KINDS, (False, True))), quick=(0, 5, 8, 10, 14))
 def test_functions_by_differences_of_computed_observations(kind: Transformation, by_elements: bool) -> None:
     """F(l(x), x) = 0 defines l(x), so that dl/dx = -A^-1 B: by central differences of l for every unknown, of an image
-    without a scanner and of three of one that bends."""
+    without a scanner and of three of one that bends, with displacements of points and of images."""
     rng = np.random.default_rng(11)
     middle_mm = nets.SCAN_MIDDLE_MM if kind != "none" else (0.0, 0.0)
     truth = nets.Truth(mirrored=(False, kind != "none", False, False), middle_mm=middle_mm)
     network, start = nets.simulated(rng, truth, kind, point_sigma=np.inf, free={"k3": np.inf, "k5": np.inf})
     network = nets.bend_in_scanner(network, {}, BEND)
     network = replace(network, images=(replace(network.images[0], scanner=""), *network.images[1:]))
+    fields = [rng.normal(size=(len(network.observations), 2, axes)) for axes in (3, 2)]
+    boards = (Board(name, {}, (Prior(0.2, np.inf),) * 2, each) for name, each in zip("ab", fields, strict=True))
+    network = replace(network, boards=tuple(boards))
     problem = number(network, start, by_elements)
     every = np.where(problem.unknowns.sigma > 0.0, problem.unknowns.sigma, np.inf)
     problem = replace(problem, unknowns=replace(problem.unknowns, sigma=every))
@@ -113,7 +116,8 @@ def apart(problem: Problem) -> list[list[int]]:
     """The unknowns by what they are, of all images and points: no observation depends on two of one kind."""
     groups: dict[tuple[str, str], list[int]] = {}
     for position, name in enumerate(each.text for each in problem.unknowns.parameters):
-        groups.setdefault((name.split(".")[0], name.rsplit(".", 1)[1]), []).append(position)
+        kind = name.split(".")[0]
+        groups.setdefault((name if kind == "BD" else kind, name.rsplit(".", 1)[1]), []).append(position)
     return list(groups.values())
 
 

@@ -50,6 +50,56 @@ def test_what_the_model_lacks_is_named(name: str, seed: int) -> None:
     assert faults.misfit_outcome(name, sentences) == "named", sentences
 
 
+LARGE = [
+    ("lens: k1 alone", 30.0), ("axes not perpendicular", 100.0), ("pictures bowed", 30.0), ("focus drifts", 30.0),
+    ("lens: no decentering", 30.0), ("rows of all images jump", 30.0),
+]  # fmt: skip
+
+
+@parametrize_with_studies(("name", "many"), LARGE)
+def test_large_effects_are_named_and_nothing_else(name: str, many: float) -> None:
+    """Displacements of the first order had left suspects, groups of images, decentering and jumps."""
+    sentences, _ = faults.misfit_sentences(faults.draw_network(name, 1, many))
+    assert faults.misfit_outcome(name, sentences) == "named", sentences
+
+
+@parametrize_with_studies("seed", [3, 5, 7])
+def test_a_field_seen_in_a_mirror_is_named_though_its_lens_is_free(seed: int) -> None:
+    """The trial had ended before v'Pv agreed: "the iteration did not stand still"."""
+    rng = np.random.default_rng([9, seed])
+    given = faults.misfit_network(faults.scene(seed, flat=False), faults.Effects(), SOUND, rng)
+    mirrored = replace(given.observations, xy_mm=given.observations.xy_mm * (-1.0, 1.0))
+    with pytest.raises(AdjustmentError, match=r"^The points are mirrored"):
+        adjust(replace(given, observations=mirrored))
+
+
+def test_a_large_bow_is_found_where_it_leads() -> None:
+    """The first order had left a bow of the rows, 14 standard deviations of it."""
+    given = faults.misfit_network(faults.scene(2, flat=True), faults.Effects(bow=0.01), SOUND, np.random.default_rng(9))
+    result = adjust(given)
+    (found,) = result.explanations
+    assert found.kind == "bow"
+    assert result.suspects == ()
+    value, sigma = re.findall(r"rows (\S+) ± (\S+) µm", found.cause)[0]
+    assert abs(float(value)) < 3.0 * float(sigma)
+
+
+@parametrize_with_studies("off_mm", [0.3, 2.0, 0.1])
+@parametrize_with_studies("b1", [0.0, 0.003], quick=(0, 1))
+def test_one_wrong_mark_is_named_alone_and_beside_pixels_that_are_not_square(off_mm: float, b1: float) -> None:
+    """All marks of its image had been left out, or the images had been distorted each in its own way."""
+    made, rng = faults.scene(2, flat=True), np.random.default_rng(9)
+    given = faults.misfit_network(made, faults.Effects(b1=b1), SOUND, rng)
+    observations, row = given.observations, len(given.observations) // 3
+    xy_mm = observations.xy_mm.copy()
+    xy_mm[row] += (off_mm, -off_mm)
+    result = adjust(replace(given, observations=replace(observations, xy_mm=xy_mm)))
+    assert not result.left_out
+    assert [each.kind for each in result.explanations] == (["pixels"] if b1 else [])
+    wrong = f"target {observations.point[row]} in image {observations.image[row]}"
+    assert [each.tested.name for each in result.suspects] == [wrong]
+
+
 @pytest.mark.parametrize("seed", [2, pytest.param(14, marks=pytest.mark.study)])
 def test_nothing_else_is_blamed_with_a_stale_distortion(seed: int) -> None:
     given = faults.misfit_network(faults.scene(seed, flat=True), faults.Effects(), SOUND, np.random.default_rng(seed))
