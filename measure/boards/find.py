@@ -207,11 +207,13 @@ def _part_of_chessboard(picture: Bytes, pattern: WholePattern, spec: ChessboardS
     borders = tuple(
         ended and _has_border(picture, np.rot90(pattern.grid, side)) for side, ended in enumerate(pattern.has_ended)
     )
-    is_whole = pattern.is_bounded and pattern.grid.shape[:2] in ((spec.rows, spec.columns), (spec.columns, spec.rows))
-    has_borders = is_whole or ((borders[0] or borders[2]) and (borders[1] or borders[3]))
+    has_count = pattern.grid.shape[:2] in ((spec.rows, spec.columns), (spec.columns, spec.rows))
+    has_borders = (has_count and pattern.is_bounded) or ((borders[0] or borders[2]) and (borders[1] or borders[3]))
     namings = list(_namings(picture, pattern.grid, borders, spec)) if has_borders else []
     if not namings or any(not _are_alike(namings[0], naming, spec) for naming in namings):
-        return FoundBoard({}, Reason(_refusal(spec, pattern), Code.NO_BOARD))
+        is_resolved = bool(_shorter_steps(pattern.grid).min() > _SMOOTHED_PX)  # else it may go on at a finer reduction
+        is_other = pattern.is_bounded and is_resolved and not has_count
+        return FoundBoard({}, Reason(_refusal(spec, pattern), Code.NO_BOARD), is_of_other_count=is_other)
 
     def uprightness(naming: Integers) -> float:
         """Covariance of the board's columns with the column in the image: largest for the upright naming."""
@@ -380,8 +382,8 @@ def _right_handed(grid: Array) -> Array:
 
 
 def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec | SquareGridSpec) -> FoundBoard:
-    """Find a board in a reduced scan, then at a finer reduction, which small boards in large scans need. A whole
-    chessboard is first searched in a coarse image."""
+    """Find a board in a reduced scan, then at a finer reduction, which small boards in large scans need: the older
+    detector takes 10 s there where the count is wrong. A whole chessboard is first searched in a coarse image."""
     longest = max(scan.width_px, scan.height_px)
     *sizes, quick = (max(round(longest / size), 1) for size in (_FIRST_SIZE_PX, _LAST_SIZE_PX, _QUICK_SIZE_PX))
     if isinstance(spec, ChessboardSpec) and quick > max(sizes):
@@ -390,7 +392,7 @@ def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec | Squa
             return replace(found, others_px=_other_chessboards(scan, found, spec, max(sizes)))
     for factor in sorted(set(sizes), reverse=True):
         found = _find_reduced(scan, spec, factor)
-        if found.corners or found.reason.code == Code.CONTRAST:
+        if found.corners or found.is_of_other_count or found.reason.code == Code.CONTRAST:
             break
     if found.corners and isinstance(spec, ChessboardSpec):
         found = replace(found, others_px=_other_chessboards(scan, found, spec, factor))

@@ -251,6 +251,7 @@ class FoundBoard:
     others_px : centres of further boards that look the same.
     notes : messages to the user.
     is_mirrored : whether the image shows the board mirrored.
+    is_of_other_count : whether a whole chessboard of another count was found.
     """
 
     corners: dict[str, FoundCorner]
@@ -260,6 +261,7 @@ class FoundBoard:
     others_px: tuple[Array, ...] = ()
     notes: tuple[str, ...] = ()
     is_mirrored: bool = False
+    is_of_other_count: bool = False
 
     def mirror(self, width_px: int) -> "FoundBoard":
         """Convert to the board of the image mirrored left to right."""

@@ -253,6 +253,21 @@ def test_strong_sharpening_makes_no_corner_weak(large_board: tuple[Array, dict[s
     assert np.abs(draw.errors_px(board, truth)).max() < 0.1
 
 
+def test_a_board_of_another_count_is_not_searched_at_full_size(
+    large_board: tuple[Array, dict[str, Array]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pictures of 12 megapixels took 13 s each where the count was wrong."""
+    factors, search = list[int](), find._find_reduced
+    monkeypatch.setattr(find, "_FIRST_SIZE_PX", draw.WIDTH)
+    monkeypatch.setattr(
+        find, "_find_reduced", lambda scan, spec, factor: factors.append(factor) or search(scan, spec, factor)
+    )
+    enlarged = np.kron(large_board[0], np.ones((2, 2)))
+    reason = measure_board(draw.make_scan(enlarged), replace(LARGE, columns=8)).reason
+    assert "one of 9 x 6 is. Correct the count" in reason
+    assert factors == [2]
+
+
 def test_the_clip_of_a_clipboard_is_no_further_column(large_board: tuple[Array, dict[str, Array]]) -> None:
     """It looks like three of six corners, and the board had been refused as one of 10 x 6."""
     square, longer = draw.chessboard_dark(LARGE), draw.chessboard_dark(replace(LARGE, columns=10))
