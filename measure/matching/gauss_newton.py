@@ -163,8 +163,6 @@ class PictureFit(FitModel):
         self.choose_area()
         if not self.reason and np.ptp(model.grey[self.area]) == 0.0:
             self.reason = Reason("the image is uniform there: nothing stands out", Code.CONTRAST)
-        if self.reason:
-            return
         model.bent = ROUGHLY_BENT
         self._adjust(0.1)
         if self.reason not in (NO_REASON, UNSETTLED):
