@@ -37,7 +37,8 @@ def check_plausibility(result: Adjustment, trials: Trials) -> Adjustment:
     remarks, misread = list(_marks_outside(result, outside, trials)), tuple(_both_sides(result, trials))
     if result.converged and not outside and not result.coordinate_blunders:
         remarks += [each for view in views for each in _principal_point(view, result, trials.family)]
-    return replace(result, misread=misread, remarks=(*result.remarks, *remarks))
+    # Orientations unlike those given may be consequences.
+    return replace(result, misread=misread, remarks=(*remarks, *result.remarks))
 
 
 class _CameraView(NamedTuple):

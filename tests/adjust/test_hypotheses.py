@@ -73,6 +73,14 @@ def test_a_field_seen_in_a_mirror_is_named_though_its_lens_is_free(seed: int) ->
         adjust(replace(given, observations=mirrored))
 
 
+def test_marks_outside_the_picture_are_told_before_orientations_that_follow_from_them() -> None:
+    """ "Z0 with the other sign" had come first."""
+    kind = replace(SOUND, c_given=True, stations_given=True, frame_given=True)
+    made = faults.scene(2, flat=True)
+    given = faults.misfit_network(made, faults.Effects(y_down=True), kind, np.random.default_rng(9))
+    assert "marks lie outside the picture" in adjust(given).warnings[0]
+
+
 def test_a_large_bow_is_found_where_it_leads() -> None:
     """The first order had left a bow of the rows, 14 standard deviations of it."""
     given = faults.misfit_network(faults.scene(2, flat=True), faults.Effects(bow=0.01), SOUND, np.random.default_rng(9))
