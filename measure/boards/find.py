@@ -48,6 +48,7 @@ _FEWEST_MARKERS = 6  # markers that exclude false alarms
 _FIRST_SIZE_PX, _LAST_SIZE_PX = 1500, 4000  # px, longer side of the reduced images searched
 _QUICK_SIZE_PX = 640  # px, longer side at which most boards are found in a quarter of the time
 _ENOUGH_PIXELS = 100_000  # sample for the range of grey values
+_AROUND, _FAINTEST = 40, 1e-3  # of flattening: longer side over the local blur's, and the least local contrast
 _LEAST_CONTRAST = 0.01  # fraction of full scale; below it nothing is visible, and the search takes long
 
 
@@ -394,16 +395,25 @@ def find_board(scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec | Squa
         found = _find_reduced(scan, spec, factor)
         if found.corners or found.is_of_other_count or found.reason.code == Code.CONTRAST:
             break
-    if found.corners and isinstance(spec, ChessboardSpec):
-        found = replace(found, others_px=_other_chessboards(scan, found, spec, factor))
-    return found
+    if not isinstance(spec, ChessboardSpec):
+        return found
+    if found.corners:
+        return replace(found, others_px=_other_chessboards(scan, found, spec, factor))
+    if found.is_of_other_count or found.reason.code == Code.CONTRAST:
+        return found
+    flattened = _find_reduced(scan, spec, max(sizes), is_flattened=True)
+    return flattened if flattened.corners else found
 
 
 def _find_reduced(
-    scan: Scan, spec: ChessboardSpec | ArucoSpec | CharucoSpec | SquareGridSpec, factor: int, is_quick: bool = False
+    scan: Scan,
+    spec: ChessboardSpec | ArucoSpec | CharucoSpec | SquareGridSpec,
+    factor: int,
+    is_quick: bool = False,
+    is_flattened: bool = False,
 ) -> FoundBoard:
     """Find a board in the scan reduced by a factor. Returns coordinates of the full scan."""
-    picture, reason = _searchable(scan, factor)
+    picture, reason = _searchable(scan, factor, is_flattened)
     if reason:
         return FoundBoard({}, reason)
     if isinstance(spec, ChessboardSpec):
@@ -464,13 +474,18 @@ def _first_factor(scan: Scan) -> int:
     return max(round(max(scan.width_px, scan.height_px) / _FIRST_SIZE_PX), 1)
 
 
-def _searchable(scan: Scan, factor: int) -> tuple[Bytes, Reason]:
-    """Reduced scan stretched to 8 bits, and the reason if it has no contrast to search in."""
+def _searchable(scan: Scan, factor: int, is_flattened: bool = False) -> tuple[Bytes, Reason]:
+    """Reduced scan stretched to 8 bits, and the reason if it has no contrast to search in. is_flattened: less its local
+    mean, over its local standard deviation, in which a faint board on a warm or shaded sheet stands out."""
     grey = scan.reduced(factor) if factor > 1 else scan.window(0, 0, scan.width_px, scan.height_px)
+    if is_flattened:
+        around_px = max(grey.shape) / _AROUND
+        grey = grey - cv2.GaussianBlur(grey, (0, 0), around_px)
+        grey /= np.sqrt(cv2.GaussianBlur(grey * grey, (0, 0), around_px)) + _FAINTEST * scan.full_scale_dn
     every = max(round(np.sqrt(grey.size / _ENOUGH_PIXELS)), 1)
     shown = np.sort(grey[::every, ::every], axis=None)  # several times as fast as np.percentile
     low, high = shown[len(shown) // 100], shown[-1 - len(shown) // 100]
-    if high - low < _LEAST_CONTRAST * scan.full_scale_dn:
+    if not is_flattened and high - low < _LEAST_CONTRAST * scan.full_scale_dn:
         share = 100 * (high - low) / scan.full_scale_dn
         message = f"the scan has no contrast: its grey values span {share:.1f} % of the scale"
         return np.zeros((1, 1), np.uint8), Reason(message, Code.CONTRAST)

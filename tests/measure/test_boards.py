@@ -253,6 +253,17 @@ def test_strong_sharpening_makes_no_corner_weak(large_board: tuple[Array, dict[s
     assert np.abs(draw.errors_px(board, truth)).max() < 0.1
 
 
+def test_a_faint_board_on_a_warm_sheet_is_found(large_board: tuple[Array, dict[str, Array]]) -> None:
+    """As a thermal camera sees one: its squares differ by 8 %, the sheet by ten times as much."""
+    picture, truth = large_board
+    row, col = np.indices(picture.shape, float)
+    warm = np.exp(-(((col - 150.0) / 110.0) ** 2) - ((row - 130.0) / 110.0) ** 2)
+    light = np.clip((picture - 8000.0) / 30000.0, 0.0, 1.0)
+    board = measure_board(draw.make_scan(2000.0 + 50000.0 * (0.1 + warm) * (0.92 + 0.08 * light)), LARGE)
+    assert sum(mark.status.is_observation for mark in board.marks) > 45
+    assert np.abs(draw.errors_px(board, truth)).max() < 0.25
+
+
 def test_a_board_of_another_count_is_not_searched_at_full_size(
     large_board: tuple[Array, dict[str, Array]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
