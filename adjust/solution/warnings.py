@@ -285,7 +285,7 @@ def curved_valley_warnings(run: Run, cofactor: Cofactor) -> Iterator[str]:
                 moved_by = per_mm[list(positions).index(position) - 1] * sign * FAR * sigma[k]
                 yield (
                     f"The images hardly tell {what} of camera {name} from its distortion, and its standard deviation "
-                    f"is too small: moved by {moved_by:+.2g} {unit}, {FAR:g} of them, it fits "
+                    f"is too small: moved by {moved_by:+.3g} {unit}, {FAR:g} of them, it fits "
                     f"{'better' if least < 0.0 else 'nearly as well'} (v'Pv rises by {least:.2g}, not by {FAR**2:g}). "
                     "Hold the decentering distortion at 0, give principal_point_mm, or add images with other tilts."
                 )
