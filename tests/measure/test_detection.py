@@ -12,9 +12,9 @@ from studies import parametrize_with_studies
 from true_marks import KIND, some_mark
 
 from measure import FiducialOptions, MatchOptions
-from measure.detection.correlation import CLOSE, GRAINY, WIDE, Map, Surroundings, correlation
+from measure.detection.correlation import CLOSE, GRAINY, Map, Surroundings, correlation
 from measure.detection.localisation import MarkPrediction, localise
-from measure.detection.responses import ByteCache, CorrelationMaps, Responses, Templates
+from measure.detection.responses import ByteCache, Responses
 from measure.detection.significance import chance_of_marks, expected_peaks, share_of_places
 from measure.fiducials.faint_marks import FaintMark, detect_faint
 from measure.fiducials.mark_fit import detect_mark
@@ -239,18 +239,6 @@ def test_responses_are_freed_with_the_search_and_not_by_the_next_garbage_collect
         assert alive() is None
     finally:
         gc.enable()
-
-
-RNG = np.random.default_rng(4)
-SCAN = make_scan(RNG.integers(0, 65535, (90, 110, 3)).astype(float))
-CHIPS = RNG.normal(size=(2, 9, 9))
-TURNED = [np.rot90(chip, turn) for turn in range(4) for chip in CHIPS]  # in one pose after another
-SET = Templates(TURNED, [2.0, 3.0] * 4, (), 1)
-
-
-def maps(cache: ByteCache) -> CorrelationMaps:
-    channels = [SCAN.window(-4, -4, 118, 98, weights) for weights in np.eye(3).tolist()]
-    return CorrelationMaps(channels, SET, (1, -1), WIDE, 100.0, cache)
 
 
 def test_lines_as_fine_as_the_grain_answer_at_closer_matching_by_what_the_grain_hides_least() -> None:

@@ -21,7 +21,7 @@ from measure import FiducialOptions, FrameMeasurement, Scan, Status, measure_fid
 from measure.detection.responses import SearchEffort
 from measure.fiducials import stages
 from measure.fiducials.channel_weights import best_weights, registered_channels
-from measure.fiducials.measure_frame import Frame
+from measure.fiducials.measure_frame import Frame, measure_frame
 from measure.fiducials.measurement import coarseness
 from measure.fiducials.options import CLICK_SIGMA_PX, Click
 from measure.fiducials.scan_checks import other_frames, pitch_problem
@@ -79,7 +79,7 @@ def test_a_wrong_tag_costs_a_thumbnail_one_search_and_one_measured_frame(monkeyp
     layout, matrix = draw.lay_out([MarkShape(draw.RING_CROSS)] * 9, places), draw.pixel_from_camera("0")
     scan = draw.make_scan(draw.frame_picture(layout, matrix))
     searched_um, measured_um = list[float](), list[float]()
-    search_scan, measure_frame = FrameSearch.search_scan, stages.measure_frame
+    search_scan = FrameSearch.search_scan
 
     def counted_search(self: FrameSearch, options: FiducialOptions, hypotheses: Any, surroundings: Any) -> SearchResult:
         searched_um.extend(1000 * each.drawn_mm[0] for each in hypotheses)
