@@ -154,7 +154,7 @@ def image_displacements(problem: Problem, state: State, rows: Rows) -> Array:
     return np.asarray((values[:, :, None] * problem.board_directions[rows, :, 3:]).sum(axis=1))
 
 
-def beside_lens(problem: Problem, state: State, computed_mm: Array, camera: str, image_mm: Array) -> Array:
+def remove_lens_effects(problem: Problem, state: State, computed_mm: Array, camera: str, image_mm: Array) -> Array:
     """Displacements (n, k, 2) of a camera's images but for what its parameters that are not fixed displace."""
     rows = problem.targets_by_camera[camera]
     shown = _image_targets(problem, state, camera, rows)

@@ -20,7 +20,7 @@ from adjust.functional_model.lens import INTERIOR_NAMES, Prior
 from adjust.functional_model.scanner import is_left
 from adjust.functional_model.transformation import LATTICE, film_kind, fit_transformation
 from adjust.problem.camera import Camera
-from adjust.problem.condition_equations import beside_lens, camera_places, image_displacements
+from adjust.problem.condition_equations import camera_places, image_displacements, remove_lens_effects
 from adjust.problem.network import Approximations, Board, Network, Scanner, Transformation
 from adjust.problem.parameter import shortened
 from adjust.problem.problem import Problem, number
@@ -332,7 +332,11 @@ def _displaced_images(
         at = fields(_from_principal_point(last, camera.name))
         # What the lens has is no part of what it lacks, even where it is given with a standard deviation.
         is_of_lens = kind in ("radial", "decentering")
-        return beside_lens(last.problem, last.end.state, last.end.computed_mm, camera.name, at) if is_of_lens else at
+        return (
+            remove_lens_effects(last.problem, last.end.state, last.end.computed_mm, camera.name, at)
+            if is_of_lens
+            else at
+        )
 
     def anew(last: Run) -> Problem:
         """Take the displacements from where the images lie with them in the model."""

@@ -58,8 +58,8 @@ def _turned(xy_mm: Array) -> Array:
     """The figure with its first fiducial at the lower left and the next ones clockwise from there."""
     complex_mm = (xy_mm - xy_mm.mean(axis=0)) @ [1.0, 1j]
     complex_mm = complex_mm / complex_mm[0] * abs(complex_mm[0])
-    beside = complex_mm[np.abs(complex_mm.imag) > 0.1 * np.abs(complex_mm)]
-    if len(beside) and beside[0].imag > 0:
+    off_axis = complex_mm[np.abs(complex_mm.imag) > 0.1 * np.abs(complex_mm)]
+    if len(off_axis) and off_axis[0].imag > 0:
         complex_mm = complex_mm.conj()
     complex_mm = complex_mm * np.exp(1j * FIRST_RAD)
     return np.column_stack([complex_mm.real, complex_mm.imag])

@@ -265,8 +265,8 @@ def _lens_problems(data: ReportData, solved: AdjustmentRecord) -> Iterator[Repor
     for name, camera in solved.cameras.items():
         c = camera.principal_distance_mm
         sigma = max(c.sigma, c.sigma_clusters or 0.0)
-        is_said = any(each.startswith(f"The principal distance of camera {name} is") for each in solved.warnings)
-        if not (c.given and math.isfinite(c.given.sigma)) and sigma > LOOSE * c.value and not is_said:
+        has_warning = any(each.startswith(f"The principal distance of camera {name} is") for each in solved.warnings)
+        if not (c.given and math.isfinite(c.given.sigma)) and sigma > LOOSE * c.value and not has_warning:
             yield ReportedProblem(
                 f"The principal distance of {name} is known to {100.0 * sigma / c.value:.0f} % only: the images "
                 "hardly separate it from how far away they were taken.",

@@ -64,7 +64,7 @@ def test_large_effects_are_named_and_nothing_else(name: str, many: float) -> Non
 
 
 @parametrize_with_studies("seed", [3, 5, 7])
-def test_a_field_seen_in_a_mirror_is_named_though_its_lens_is_free(seed: int) -> None:
+def test_a_mirrored_field_is_named_though_its_lens_is_free(seed: int) -> None:
     """The trial had ended before v'Pv agreed: "the iteration did not stand still"."""
     rng = np.random.default_rng([9, seed])
     given = faults.misfit_network(faults.scene(seed, flat=False), faults.Effects(), SOUND, rng)
@@ -73,7 +73,7 @@ def test_a_field_seen_in_a_mirror_is_named_though_its_lens_is_free(seed: int) ->
         adjust(replace(given, observations=mirrored))
 
 
-def test_marks_outside_the_picture_are_told_before_orientations_that_follow_from_them() -> None:
+def test_marks_outside_the_picture_come_before_orientations_that_follow_from_them() -> None:
     """ "Z0 with the other sign" had come first."""
     kind = replace(SOUND, c_given=True, stations_given=True, frame_given=True)
     made = faults.scene(2, flat=True)
@@ -94,7 +94,7 @@ def test_a_large_bow_is_found_where_it_leads() -> None:
 
 @parametrize_with_studies("off_mm", [0.3, 2.0, 0.1])
 @parametrize_with_studies("b1", [0.0, 0.003], quick=(0, 1))
-def test_one_wrong_mark_is_named_alone_and_beside_pixels_that_are_not_square(off_mm: float, b1: float) -> None:
+def test_one_wrong_mark_is_named_alone_and_with_pixels_that_are_not_square(off_mm: float, b1: float) -> None:
     """All marks of its image had been left out, or the images had been distorted each in its own way."""
     made, rng = faults.scene(2, flat=True), np.random.default_rng(9)
     given = faults.misfit_network(made, faults.Effects(b1=b1), SOUND, rng)

@@ -446,7 +446,7 @@ def test_a_picture_of_another_print_is_named_and_no_other(odd: tuple[str, ...], 
     assert all("another print of the board" in why for why in found.values())
 
 
-def test_what_is_wrong_with_pictures_is_told_in_pixels(tmp_path: Path) -> None:
+def test_what_is_wrong_with_pictures_is_given_in_pixels(tmp_path: Path) -> None:
     """The µm were those of a pixel that nobody had given. Right of 150 px marks lie 0.3 px right and 0.2 px lower."""
     project, marks = simulated_marks(tmp_path)
     shift_mm = 0.005 * np.array([0.3, -0.2])
