@@ -86,7 +86,7 @@ _FAR = 4.0  # times the median misfit of the inliers: nearly five standard devia
 _NEAR = 2.0  # times the same: one good mark in sixteen lies farther off
 _LEAST_SCATTER_MM = 2 * SCATTER_MM  # mm, least median misfit: a few marks may agree by chance better than film allows
 _FAILED = {Code.NO_FIT, Code.OFF_PLACE, Code.SIZE, Code.POLARITY}  # reasons that another tone curve may cure
-_SAME_MARK_PX = 5.0  # px between two fits of one mark at most; two marks lie farther apart: each is some 14 px large
+SAME_MARK_PX = 5.0  # px between two fits of one mark at most; two marks lie farther apart: each is some 14 px large
 REDUCED_PX = 1.5  # px of the reduced scan: accuracy of the places that a placement predicts
 _CLICK_REACH_PX = 6 * CLICK_SIGMA_PX  # px around a click: three sigma, doubled for people who point less accurately
 LEAST_LIKENESS = 0.35  # correlation with the drawing: below it texture, text and scratches are as similar
@@ -331,7 +331,7 @@ class Frame:
         if not others or len(others) >= len(own):
             return False
         nearest = np.hypot(*np.moveaxis(np.array(others)[:, None] - np.array(own)[None], -1, 0)).min(axis=1)
-        return bool(nearest.max() < _SAME_MARK_PX)
+        return bool(nearest.max() < SAME_MARK_PX)
 
     def verdict(self, index: int) -> tuple[Status, Reason]:
         """Status of a mark and the reasons for it.

@@ -17,7 +17,7 @@ from measure.fiducials.clicked_frame import clicked_frame
 from measure.fiducials.constellation import FREE_MARKS, Placement
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA
 from measure.fiducials.mark_fit import Detection
-from measure.fiducials.measure_frame import Frame, detect_some, measure_frame, orient_frame, rename_frame
+from measure.fiducials.measure_frame import SAME_MARK_PX, Frame, detect_some, measure_frame, orient_frame, rename_frame
 from measure.fiducials.options import CLICK_SIGMA_PX, Click, FiducialOptions
 from measure.fiducials.scan_orientation import decide_scan_orientation
 from measure.fiducials.search import SearchResult, false_placements
@@ -216,12 +216,15 @@ def _rivals(result: SearchResult, frame: Frame) -> list[Reason]:
         # perspective of a film photographed obliquely, if they are nearest to it under the names they have.
         if fits and np.hypot(*(other.places_px(found_mm) - found_px).T).max() <= frame.first_search_px:
             continue
-        if fits and frame.options.is_oblique and other.names(found_px, frame.camera_mm).tolist() == list(fits):
+        has_same_names = bool(fits) and other.names(found_px, frame.camera_mm).tolist() == list(fits)
+        if has_same_names and frame.options.is_oblique:
             continue
         as_good = other.score >= _AMBIGUOUS * best.score and (
             other.supported >= best.supported - 1 or _lacks_its_own(frame, other)
         )
         if not ((as_good and not _outdoes(frame, other)) or _is_another_frame(result, other, frame)):
+            continue
+        if has_same_names and _finds_same_marks(frame, other):
             continue
         linear, shifts = best.pixel_from_camera[:, :2], (each.pixel_from_camera[:, 2] for each in (other, best))
         shift = np.linalg.solve(linear, np.subtract(*shifts))
@@ -258,6 +261,15 @@ def _lacks_its_own(frame: Frame, rival: Placement) -> bool:
     apart_px, _ = cKDTree(rival.places_px(frame.camera_mm)).query(frame.predicted_px)
     own = frame.inside & (apart_px > frame.first_search_px)
     return bool(own.any() and found[own].mean() < _FEWER_FOUND * found[frame.inside].mean())
+
+
+def _finds_same_marks(frame: Frame, rival: Placement) -> bool:
+    """Whether measuring from a rival placement finds marks of a frame alone, under the names that they have there."""
+    there = measure_frame(frame.scan, frame.layout, rival, frame.options).inlier_fits
+    own = frame.inlier_fits
+    return bool(there) and all(
+        name in own and np.hypot(*(fit.center_px - own[name].center_px)) < SAME_MARK_PX for name, fit in there.items()
+    )
 
 
 def _outdoes(frame: Frame, rival: Placement) -> bool:

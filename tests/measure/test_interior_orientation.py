@@ -365,6 +365,19 @@ def test_names_one_step_off_along_y_are_ruled_out_by_the_lower_and_upper_edges_o
     assert len(measurement._rivals(result, frame)) == count
 
 
+def test_a_placement_from_which_the_same_marks_are_found_is_no_rival() -> None:
+    """1.8 % larger about one mark: the opposite one lies beyond its first search, as a coarse search leaves it."""
+    best = replace(placement("0"), supported=4)
+    frame = measure_frame(make_scan(picture(DOTS, "0")), DOTS, best, OPTIONS)
+    matrix, at = best.pixel_from_camera, best.places_px(frame.camera_mm[:1])[0]
+    larger = np.column_stack([1.018 * matrix[:, :2], 1.018 * (matrix[:, 2] - at) + at])
+    rival = replace(best, pixel_from_camera=larger)
+    off_px = np.hypot(*(rival.places_px(frame.camera_mm) - best.places_px(frame.camera_mm)).T)
+    assert off_px.max() > frame.first_search_px
+    assert not best.same_place(rival)
+    assert not measurement._rivals(cast(Any, SimpleNamespace(placements=(best, rival))), frame)
+
+
 @pytest.mark.parametrize(("moved_px", "times"), [(0.0, 1), (0.2, 1), (1.0, 2)])
 def test_faint_marks_are_sought_again_only_where_predictions_moved(
     moved_px: float, times: int, monkeypatch: pytest.MonkeyPatch
