@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from measure.annotations.lines import KnownLine, Line
 from measure.annotations.text import networks, read_writing
-from measure.array_types import Array, Indices
+from measure.array_types import Array
 from measure.fiducials.clicked_frame import clicked_frame
 from measure.fiducials.constellation import FREE_MARKS, Placement
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA
@@ -33,7 +33,6 @@ from measure.marks.shapes import (
     limit_to_frame,
 )
 from measure.matching.covariance import honest_covariance
-from measure.matching.frame_edge import edge_evidence
 from measure.noise.scan_alterations import find_alterations
 from measure.results import Covariance, FrameMeasurement, MarkMeasurement, ScanOrientation
 from measure.scans.scan import Scan
@@ -49,7 +48,6 @@ _OBLIQUE = Reason(
 )
 _FRAME_SHIFT = 0.95  # fraction of the frame's size: a rival shifted by more is another photograph
 _AMBIGUOUS = 0.9  # fraction of the best score from which another placement is a rival
-_EDGES_APART_MM = 2.0  # distance from which on edges predicted by two placements are different ones
 _FEWER_FOUND = 0.5  # times the fraction of all marks found
 _PLAIN_PX = 3.0  # px across the finest line of a mark: both edges and the inside are resolved
 _ASSUMED = Reason(
@@ -228,10 +226,6 @@ def _rivals(result: SearchResult, frame: Frame) -> list[Reason]:
             continue
         linear, shifts = best.pixel_from_camera[:, :2], (each.pixel_from_camera[:, 2] for each in (other, best))
         shift = np.linalg.solve(linear, np.subtract(*shifts))
-        # An edge that both give to the frame, as of a line of crosses along it, is evidence for neither.
-        apart = np.abs(shift)[[1, 0, 1, 0]] > _EDGES_APART_MM
-        if apart.any() and (_edges(frame, other) - _edges(frame, best))[apart].sum() < 0:
-            continue
         shift_mm = f"({shift[0]:.1f}, {shift[1]:.1f}) mm"
         if (np.abs(shift) > _FRAME_SHIFT * np.array(frame.layout.frame_mm)).any():
             sentence = (
@@ -246,12 +240,6 @@ def _rivals(result: SearchResult, frame: Frame) -> list[Reason]:
             )
             problems.append(Reason(sentence, Code.AMBIGUOUS))
     return problems[:3]
-
-
-def _edges(frame: Frame, placement: Placement) -> Indices:
-    """(4,) evidence for the edges that a placement gives the exposed frame, the lower one first."""
-    corners_px = frame_corners_px(placement.pixel_from_camera, frame.layout)
-    return edge_evidence(frame.scan, corners_px, 1 / float(np.mean(placement.pitch_mm)), frame.weights)
 
 
 def _lacks_its_own(frame: Frame, rival: Placement) -> bool:

@@ -45,9 +45,6 @@ _BLUR_RANGE_PX = (0.3, 4.0)  # px: smaller blur is hidden by the pixel, with lar
 _SCATTER_FLOOR_PX = 0.01  # px, floor of the scatter around a line, which is zero in clean images
 _LEAST = 1e-6  # regularisation, fraction of the trace of the covariance floor
 _DRAWN = 0.005  # fraction of the step: smaller residuals may be errors of the model
-_EDGE_MM = 0.7  # largest distance of the exposed frame's edge from the predicted one: frames' sizes are nominal
-_BEYOND_MM = (-1.0, 1.0, 3.0, 5.0)  # distances of lines parallel to an edge from it, outwards
-_ALIKE_LINES, _AS_VARIED = 0.3, 0.25  # correlation of neighbouring ones, and share of the variation inside
 _ROUNDED = 0.1  # fraction of the reach excluded at every corner, since few corners are sharp
 
 
@@ -83,49 +80,6 @@ def fit_frame_corner(
             return MarkFit(False, unseen, pixel_from_mark[:, 2], nothing, pixel_from_mark)
         edges.append(edge)
     return _intersect_edges(edges, unit, pixel_from_mark)
-
-
-def edge_evidence(scan: Scan, corners_px: Array, px_per_mm: float, weights: Sequence[float] | None = None) -> Indices:
-    """(4,) evidence for the predicted edges of the exposed frame, each from one corner to the next: 1 where it is
-    visible, -1 where the picture goes on beyond it, 0 where neither is certain.
-
-    Film outside of the exposed frame is uniform. Where the picture goes on, grey values along lines parallel to the
-    edge, inside and at several distances outside of it, vary as much, and those of neighbouring lines correlate. In the
-    dark, and outside of the scan, an edge is no evidence.
-
-    corners_px (4, 2): corners of the frame in order around it; weights: of the scan's channels.
-    """
-    evidence, center = list[int](), corners_px.mean(axis=0)
-    for start, end in zip(corners_px, np.roll(corners_px, -1, axis=0), strict=True):
-        length = float(np.hypot(*(end - start)))
-        along = (end - start) / length
-        inwards = np.array([along[1], -along[0]])
-        inwards *= np.sign(inwards @ (center - start))
-        course = _Course(scan, start, along, inwards, weights)
-        ends, search_px = (_ROUNDED * length, (1 - _ROUNDED) * length), _EDGE_MM * px_per_mm
-        if any(_find_edge(course, ends, search_px, polarity) for polarity in (1, -1)):
-            evidence.append(1)
-        else:
-            evidence.append(-1 if _picture_goes_on(course, ends, px_per_mm) else 0)
-    return np.array(evidence)
-
-
-def _picture_goes_on(course: "_Course", extent: tuple[float, float], px_per_mm: float) -> bool:
-    """Whether the picture goes on beyond an edge between two distances from its start."""
-    share = (extent[1] - extent[0]) / _PROFILES
-    middle: Array = np.asarray(extent[0] + share * (np.arange(_PROFILES) + 0.5), dtype=float)
-    lines = []
-    for distance_mm in _BEYOND_MM:
-        line = replace(course, start=course.start - distance_mm * px_per_mm * course.across)
-        light, inside = line.profiles(middle, np.zeros(_PROFILES), share, px_per_mm / 2)
-        lines.append(np.where(inside, np.median(light, axis=1), np.nan))
-    shown = np.array(lines)[:, np.isfinite(lines).all(axis=0)]
-    if shown.shape[1] < _LEAST_SHARE * _PROFILES:
-        return False
-    variation = np.ptp(np.percentile(shown, (10, 90), axis=1), axis=0)
-    if variation.min() <= max(_AS_VARIED * variation[0], FAINT * course.scan.full_scale_dn):
-        return False
-    return bool(np.diag(np.corrcoef(shown), 1).min() > _ALIKE_LINES)
 
 
 @dataclass(frozen=True, eq=False)

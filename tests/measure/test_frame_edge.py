@@ -18,7 +18,7 @@ from measure import FiducialOptions, MarkFit, ScanWindow, Status, measure_fiduci
 from measure.array_types import Single
 from measure.boards.corner_fit import Corner, CornerStart, Surface, crossing, fit_corners, quarter
 from measure.marks import shapes
-from measure.matching.frame_edge import edge_evidence, fit_frame_corner
+from measure.matching.frame_edge import fit_frame_corner
 from measure.scans.jpeg import quantisation_step_dn
 from measure.tone.curve import LINEAR, Tone, power
 
@@ -200,22 +200,6 @@ def test_a_corner_moves_with_the_tone_curve_as_its_edges_say(gamma: float) -> No
     assert np.hypot(*estimate.on_place[:, 0]) > 0.15
     assert estimate.information.sum_of_squares < 25  # of 5 figures, by the true curve
     assert fit_mark(Tone(power(gamma))).tone is None
-
-
-def test_edges_of_the_exposed_frame_are_evidence_where_the_picture_ends_or_goes_on() -> None:
-    """A frame of 30 mm, at 10 px per mm, in the middle of the scan; of its other half only the lower part is light."""
-    rng, corners = np.random.default_rng(4), 40.0 + 300.0 * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    lit = 20000.0 + 6000.0 * gaussian_filter(rng.normal(size=(380, 380)), 25.0) / 0.011
-    grey = np.full((380, 380), 1000.0)
-    grey[40:340, 40:340] = lit[40:340, 40:340]
-    night = grey.copy()
-    night[:200] = 1000.0
-    whole, dark = (make_scan(each + rng.normal(0.0, 50.0, each.shape)) for each in (grey, night))
-    to_right, down, up = (corners + off for off in ((100.0, 0.0), (0.0, 100.0), (0.0, -100.0)))
-    assert edge_evidence(whole, corners, 10.0).tolist() == [1, 1, 1, 1]
-    assert edge_evidence(whole, to_right, 10.0).tolist() == [1, 0, 1, -1]  # to the left the picture goes on
-    upper, lower = ([edge_evidence(dark, each, 10.0)[side] for each in (corners, down, up)] for side in (0, 2))
-    assert (upper, lower) == ([0, 0, 0], [1, 0, -1])
 
 
 @pytest.mark.parametrize("gamma", [1.0, 2.2])

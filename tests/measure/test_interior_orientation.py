@@ -346,25 +346,6 @@ def test_a_lattice_named_by_a_step_or_two_farther_on_is_not_measured_again(monke
     assert not measurement._is_another_frame(whole, moved(-7.0, 0.0), frame)
 
 
-@pytest.mark.parametrize(
-    ("own", "others", "count"),
-    [((0, 0, 0, 0), (0, 0, 0, 0), 1), ((1, 0, 0, 0), (0, 0, 0, 0), 0), ((0, 0, 0, 0), (0, 0, -1, 0), 0),
-     ((0, 1, 0, 1), (0, 0, 0, 0), 1), ((0, 0, -1, 0), (0, 0, 0, 0), 1)],
-)  # fmt: skip
-def test_names_one_step_off_along_y_are_ruled_out_by_the_lower_and_upper_edges_of_the_frame(
-    own: tuple[int, ...], others: tuple[int, ...], count: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scan = make_scan(picture(DOTS, "0"))
-    best = replace(placement("0"), supported=4)
-    rival = replace(best, pixel_from_camera=best.pixel_from_camera + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 80.0]]))
-    frame = measure_frame(scan, DOTS, best, OPTIONS)
-    monkeypatch.setattr(
-        measurement, "edge_evidence", lambda _, corners_px, *__: np.array(own if corners_px[2, 1] < 50.0 else others)
-    )
-    result = cast(Any, SimpleNamespace(placements=(best, rival)))
-    assert len(measurement._rivals(result, frame)) == count
-
-
 def test_a_placement_from_which_the_same_marks_are_found_is_no_rival() -> None:
     """1.8 % larger about one mark: the opposite one lies beyond its first search, as a coarse search leaves it."""
     best = replace(placement("0"), supported=4)
