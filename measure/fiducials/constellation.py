@@ -34,6 +34,7 @@ _PAIRS = 60  # pairs of marks from which hypotheses are made
 _FAR = 0.4  # fraction of the largest distance of two marks: nearer pairs determine rotation and scale poorly
 _KEPT = 12  # placements of a pose that are refined
 _STEPPED = 3  # best placements that are shifted along a lattice of marks
+_AS_GOOD = 0.9  # of the best score: a lattice whose outer line is not visible has the same under other names
 _NEIGHBOURS = 4  # nearest marks, which give the steps of a lattice
 _ALIKE = 0.5  # fraction of the marks that a step maps to others: above it they form a lattice
 _SAME_PX = 10  # px of the reduced scan: the shift up to which two placements are the same; a mark is some 14 px large
@@ -283,16 +284,23 @@ class _Constellation:
         ]
 
     def _step_along_lattice(self, scale: Complex, offset: Complex) -> tuple[Complex, Complex]:
-        """Shift the best hypotheses of a lattice step by step while the score increases: they may be many steps off."""
+        """Shift the best hypotheses of a lattice step by step while the score increases: they may be many steps off.
+
+        Returns them and those one step farther that score as well: rivals under other names.
+        """
         turned = self.search.steps_mm @ UP_FROM_CAMERA[self.pose].T
         steps = np.append(0.0, turned @ [1.0, 1.0j])
-        best = np.full(len(scale) if len(steps) > 1 else 0, -1)
+        if len(steps) == 1:
+            return scale[:0], offset[:0]
+        all_scales, best = np.repeat(scale, len(steps)), np.array([-1])
         while best.any():
             tried = offset[:, None] + scale[:, None] * steps
-            scores = self._scores(self.search.tolerance_px, np.repeat(scale, len(steps)), tried.ravel())[0]
+            scores = self._scores(self.search.tolerance_px, all_scales, tried.ravel())[0]
             best = scores.reshape(tried.shape).argmax(axis=1)
             offset = tried[np.arange(len(best)), best]
-        return scale[: len(best)], offset[: len(best)]
+        kept = scores >= _AS_GOOD * scores.max()
+        kept[:: len(steps)] = True  # not a step farther
+        return all_scales[kept], tried.ravel()[kept]
 
     def _complex(self, reduced: Array) -> Complex:
         """Convert places of the reduced scan to mm of the scan's axes."""

@@ -555,6 +555,18 @@ def test_a_lattice_whose_marks_cover_a_tenth_of_the_scan_is_not_its_own_backgrou
     assert np.abs(best.places_px(camera) - true).max() < 1.5
 
 
+def test_both_names_of_a_lattice_are_found_of_which_one_column_lies_outside() -> None:
+    """Four columns of five; the pairs that score best all have the same names."""
+    steps = 60.0 * (np.arange(5) - 2)
+    lattice = [LayoutMark(f"{x}, {y}", (float(x), float(y)), (0.01, 0.01), SMALL_DOT) for x in steps for y in steps]
+    true = np.array([mark.xy_mm for mark in lattice]) @ np.diag([1.0, -1.0]) / PITCH_MM + (210.4, 260.0)
+    rng = np.random.default_rng(1)
+    answers = replace(responses(true[5:], rng.uniform(0.5, 0.9, 20)), marks=len(lattice))
+    search = PlacementSearch(lattice, answers, (PITCH_MM, PITCH_MM), Bounds(0.04, 0.1, 1.5))
+    best = [each for each in search.find_placements("0", [0] * len(lattice)) if each.supported == 20]
+    assert sorted(round(float(each.pixel_from_camera[0, 2])) for each in best) == [210, 330]
+
+
 def test_a_lattice_named_one_step_off_lacks_the_line_that_it_alone_has(monkeypatch: pytest.MonkeyPatch) -> None:
     steps = 5.0 * (np.arange(9) - 4)
     marks = tuple(LayoutMark(f"{x}, {y}", (float(x), float(y)), (0.01, 0.01), SMALL_DOT) for x in steps for y in steps)
