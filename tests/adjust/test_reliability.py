@@ -191,11 +191,11 @@ def test_clean_observations_are_rarely_suspect() -> None:
 def test_observations_all_worse_than_stated_raise_the_limits_by_the_square_of_their_scale(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Errors three times as large as they are given: a statistic is a square, so that chance lets it be nine times."""
+    """Errors four times as large as they are given: a statistic is a square, and may be sixteen times as large."""
     monkeypatch.setattr("adjust.solution.adjustment.blunder_sentence", lambda *_: "")  # which would take longer
     network, start = checkable(3)
     rows = network.observations
-    claimed = nets.set_observations(network, covariance_mm2=rows.covariance_mm2 / 9.0)
+    claimed = nets.set_observations(network, covariance_mm2=rows.covariance_mm2 / 16.0)
     errors = np.arange(0, len(rows), 25)
     amounts = {int(row): np.array([0.12, -0.09]) for row in errors[1:2]}
     spoilt = nets.add_errors(claimed, amounts)
