@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from browser import browser_page, needs_browser, started_browser
 from loaded_script import script
 
 import reseau
@@ -121,7 +122,8 @@ def test_what_the_map_of_the_code_says_to_enter_by_exists() -> None:
 
 @pytest.mark.study
 @pytest.mark.skipif(not MKDOCS.exists(), reason="there is no environment of the documentation: make docs")
-def test_the_site_is_built_without_a_warning_and_fetches_nothing(tmp_path: Path) -> None:
+@needs_browser
+def test_the_site_is_built_without_a_warning_fetches_nothing_and_is_searched_from_disk(tmp_path: Path) -> None:
     command = [str(MKDOCS), "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
     variables = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
     done = subprocess.run(command, cwd=DOCS.parent, env=variables, capture_output=True, text=True)
@@ -132,6 +134,9 @@ def test_the_site_is_built_without_a_warning_and_fetches_nothing(tmp_path: Path)
     ]
     assert "measure_fiducials" in pages["reference/python.html"]
     assert "<math" in pages["method/theory.html"]
+    with started_browser() as browser, browser_page(browser) as page:
+        page.goto((tmp_path / "how-to" / "review.html").as_uri() + "?q=rank+defect")
+        page.locator(".md-search-result__item", has_text="The theory").first.wait_for()
 
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "docs" / "notebooks").glob("*.ipynb"))
