@@ -44,11 +44,11 @@ _NODES, _MOST_NODES = ((0.3, 2), (0.55, 3), (0.8, 5)), 10  # nodes of the quadra
 _ERF_SCALE = 0.3275911
 _ERF_FACTORS = (1.061405429, -1.453152027, 1.421413741, -0.284496736, 0.254829592)
 _SCALE_FLOOR = 0.05  # fraction of the contrast, floor of Tukey's scale: sharpening and tone curves are not damage
-_MAX_ITERATIONS = 30  # per stage
+_MAX_ITERATIONS = 100  # per stage; moiré and sharpening make some approach by a few per cent a step
 _UNDAMAGED = 0.05  # robust weight below which a pixel counts as an outlier
 # One plain and two robust stages. The residual scale is fixed at the start of each, so that the iteration converges.
 _STAGES_TOLERANCE_PX = (0.05, 0.01, 0.001)
-_SHAPE_UNKNOWNS = 5  # point (2), directions (2), blur
+_SHAPE_UNKNOWNS, _BLUR = 5, 4  # point (2), directions (2), blur
 _MOST_SHIFT = 0.6  # fraction of the reach; beyond it the edges of a different corner are nearer
 _MOST_TURN_RAD = 0.35  # rad (20°), largest turn of an edge; approximate directions are better
 _START_BLUR_PX, _LEAST_BLUR_PX = 0.8, 0.3  # px, pixel included
@@ -215,6 +215,7 @@ class _CornerFits(FitModel):
         steps = np.array([start.steps_px for start in starts], float)
         self.along_from_pixel = np.linalg.inv(steps / np.linalg.norm(steps, axis=1, keepdims=True))
         self.center = self.start.copy()
+        self.last_px, self.share = np.zeros_like(self.start), np.ones(len(starts))  # last step; fraction of it taken
         # The normal of an edge is its step turned by a quarter; the signs make the quadrant between the steps positive.
         mirrored = np.linalg.det(steps) < 0
         turn = np.pi * np.stack([mirrored, ~mirrored], axis=1)
@@ -387,15 +388,34 @@ class _CornerFits(FitModel):
         self.weights[fits] = np.asarray(self._area(fits) * tukey_weights(relative, 1.0), np.float32)
         return np.asarray(self.weights[fits])
 
+    def solve(self, fits: Indices) -> Array:
+        """Solve the normal equations. A blur at its limit is held there: sharpened edges have less than none."""
+        steps, before = super().solve(fits), self.variance[fits]
+        is_low = (before <= _LEAST_BLUR_PX**2) & (steps[:, _BLUR] < 0)
+        held = is_low | ((before >= self.max_variance[fits]) & (steps[:, _BLUR] > 0))
+        if held.any():
+            others, some = np.delete(np.arange(self.unknowns), _BLUR), fits[held]
+            weights = self.pixel_weights(some)
+            steps[held, _BLUR] = 0.0
+            steps[np.ix_(held, others)] = gauss_newton_step(
+                self.design[some][:, others], self.residuals[some], weights, self.damping
+            )
+        return steps
+
     def step(self, fits: Indices, steps: Array) -> Array:
-        """Apply steps, shortened to the range of the linearisation. Returns (m,) lengths in px."""
+        """Apply steps, shortened to the range of the linearisation, and ever more where they turn back: at a sharp edge
+        they overshoot. Returns (m,) lengths in px."""
         turn = np.abs(steps[:, 2:4]).max(axis=1) / _LONGEST_TURN_RAD
         steps = steps / np.maximum(np.maximum(np.hypot(steps[:, 0], steps[:, 1]), turn), 1.0)[:, None]
+        turns_back = (steps[:, :2] * self.last_px[fits]).sum(axis=1) < 0
+        self.share[fits] = np.minimum(self.share[fits] * np.where(turns_back, 0.5, 2.0), 1.0)
+        steps = steps * self.share[fits, None]
+        self.last_px[fits] = steps[:, :2]
         self.center[fits] += steps[:, :2]
         self.edges[fits] += steps[:, 2:4]
         self.linear[fits] += steps[:, _SHAPE_UNKNOWNS:]
         before = self.variance[fits]
-        variance = np.clip(before + steps[:, 4], before / 2, before * 2)
+        variance = np.clip(before + steps[:, _BLUR], before / 2, before * 2)
         self.variance[fits] = np.clip(variance, _LEAST_BLUR_PX**2, self.max_variance[fits])
         away = np.linalg.norm(self.center - self.start, axis=1) > self.max_shift_px
         turned = np.abs(self.edges - self.start_edges).max(axis=1) > _MOST_TURN_RAD

@@ -110,9 +110,10 @@ def influence_covariances(
     covariances = variances[:, None, None] * (flat @ flat.swapaxes(1, 2))
     coloured = np.abs(correlation) >= 3 / np.sqrt(2 * count)
     if coloured.any():
-        covariances[coloured] = _coloured_covariances(
-            influences[coloured], kept[coloured], used[coloured], variances[coloured]
-        )
+        own = _coloured_covariances(influences[coloured], kept[coloured], used[coloured], variances[coloured])
+        # Lags of few pixels are noisy: where they are no autocovariance of any noise, it is white.
+        is_definite = np.linalg.eigvalsh(np.nan_to_num(own + own.swapaxes(1, 2)))[:, 0] > 0.0
+        covariances[np.flatnonzero(coloured)[is_definite]] = own[is_definite]
     return covariances, variances
 
 

@@ -66,8 +66,9 @@ class SheetView:
                 distorted -= off / np.maximum(1.0 + 3.0 * self.radial[0] * r2 + 5.0 * self.radial[1] * r2**2, 0.1)
         place = ideal * (distorted / np.maximum(radius, 1e-12))[:, None]
         places = place * self._unit + self._middle
-        unsettled = np.hypot(*(self.undistorted(places) - ideal).T) > 1e-3
-        return np.where(unsettled[:, None], np.nan, places)
+        with np.errstate(all="ignore"):
+            is_settled = np.hypot(*(self.undistorted(places) - ideal).T) <= 1e-3
+        return np.where(is_settled[:, None], places, np.nan)
 
     def pixel_from_disks(self, sheet: Array, radius: float) -> Array:
         """(n, 2, 2) images of two orthogonal radius vectors of disks centred on points of the sheet, px."""

@@ -31,6 +31,17 @@ def test_the_variance_of_noise_is_that_before_the_fit_took_its_share() -> None:
     np.testing.assert_allclose(np.mean(variances, axis=0), sigma**2, rtol=0.03)
 
 
+def test_variances_of_few_pixels_are_positive_however_noisy_their_lags_are() -> None:
+    """Corners of small squares had been measured with negative variances, which ended in a traceback."""
+    rng, (row, column) = np.random.default_rng(1), np.indices((9, 9)) - 4
+    used = (np.maximum(abs(row), abs(column)) < 4) & (rng.random((100, 9, 9)) < 0.85)
+    white = rng.normal(size=(100, 9, 9))
+    streaks = white + np.roll(white, 1, 2) + np.roll(white, 2, 2)
+    alternating = np.stack([(-1.0) ** column, (-1.0) ** row]) * used[:, None]
+    covariances, _ = influence_covariances(alternating, streaks * used, used, 5)
+    assert np.linalg.eigvalsh(covariances).min() > 0.0
+
+
 @pytest.mark.parametrize("grows", [0.0, 0.25, 0.5])
 @pytest.mark.parametrize("damaged", [0.0, 0.2])
 def test_residuals_tell_how_noise_grows_with_light_and_damage_hardly_counts(grows: float, damaged: float) -> None:
