@@ -166,7 +166,14 @@ def _outline_shifts(columns_rows: Integers, places: list[Place]) -> list[Integer
 
 
 def _whole_counts(lattice: dict[Place, int], is_staggered: bool) -> list[tuple[int, int]]:
-    """(columns, rows) of the grid that a lattice fills best, without sparse lines at its sides; in both directions."""
+    """(columns, rows) of the grid that a lattice fills best; in both directions."""
+    scores = _count_scores(lattice, is_staggered)
+    return [count for count, score in scores.items() if score == max(scores.values())]
+
+
+def _count_scores(lattice: dict[Place, int], is_staggered: bool) -> dict[tuple[int, int], float]:
+    """How well a lattice fills grids of (columns, rows), in points, without sparse lines at its sides. Empty if most of
+    the lattice fills none: the picture then shows a part of the grid."""
     nodes, scores = np.array(list(lattice)).reshape(-1, 2), dict[tuple[int, int], float]()
     for matrix in _unit_steps([(0, 0), (1, 1)] if is_staggered else [(0, 0), (0, 1)]):
         at, is_sparse = nodes @ matrix, True
@@ -183,9 +190,22 @@ def _whole_counts(lattice: dict[Place, int], is_staggered: bool) -> list[tuple[i
         columns, rows = (high - low + 1).tolist()
         begins = not is_staggered or (at - low).sum(axis=1)[0] % 2 == 0  # with a dot
         places = (columns * rows + 1) // 2 if is_staggered else columns * rows
-        if begins and len(at) > _LEAST_SHARE * places:
+        if begins and len(at) > _LEAST_SHARE * max(places, len(lattice)):
             scores[columns, rows] = len(at) ** 2 / places
-    return [count for count, score in scores.items() if score == max(scores.values())]
+    return scores
+
+
+def grid_of_any_count(points_px: Array, appearances: Array) -> tuple[int, int, bool] | None:
+    """(columns, rows, whether it is staggered) of the grid that points form, in places as a `CircleGridSpec` counts
+    them, wider than high; staggered ones with whole numbers of dots in a row, where they have any."""
+    found = dict[tuple[int, int, bool], float]()
+    for lattice, is_staggered in product(_lattices(points_px, appearances)[:1], (False, True)):
+        scores = _count_scores(lattice, is_staggered)
+        found |= {
+            (*count, is_staggered): score for count, score in scores.items() if min(count) >= CircleGridSpec.fewest
+        }
+    best = [grid for grid, score in found.items() if score == max(found.values())]
+    return max(best, key=lambda grid: (grid[2] and grid[0] % 2 == 0, grid), default=None)
 
 
 @dataclass(frozen=True, eq=False)

@@ -345,17 +345,18 @@ def _other_layout(spec: Layout) -> Layout:
 
 def _other_layout_board(spec: ArucoSpec | CharucoSpec, other: ArucoSpec | CharucoSpec) -> FoundBoard:
     """Board without corners whose reason states which options of the specification contradict the markers."""
-    keys = ("columns", "rows", "first_marker", "first_id", "legacy")
-    differing = [key for key in keys if getattr(spec, key, None) != getattr(other, key, None)]
-    if not getattr(other, "legacy", None):
-        differing = [key for key in differing if key != "legacy" or getattr(spec, key)]
-    words = {"first_marker": "first_id"} if isinstance(other, AprilGridSpec) else {}  # names used in [targets]
-    changes = [f"{words.get(key, key)} = {str(getattr(other, key)).lower()}" for key in differing]
-    if isinstance(other, ArucoSpec) and type(other) is not type(spec):
-        is_grid = isinstance(other, AprilGridSpec)
-        gap = f"spacing = {other.gap_mm / other.marker_mm:.4g}" if is_grid else f"gap_mm = {other.gap_mm:.6g}"
-        changes = [f'kind = "{"aprilgrid" if is_grid else "aruco"}", {gap}', *changes]
-    fitting = ", ".join(changes)
+    first: str = "first_marker" if isinstance(spec, ArucoSpec) else "first_id"
+    is_older, was_older = (bool(getattr(each, "legacy", False)) for each in (other, spec))
+    kind = "aprilgrid" if isinstance(other, AprilGridSpec) else "aruco"
+    changes = {
+        f"kind {kind} and gaps of {getattr(other, 'gap_mm', 0.0):.6g} mm": type(other) is not type(spec),
+        f"{other.columns} columns": other.columns != spec.columns,
+        f"{other.rows} rows": other.rows != spec.rows,
+        f"first marker {getattr(other, first)}": getattr(other, first) != getattr(spec, first),
+        "the older layout (legacy)": is_older and not was_older,
+        "the newer layout (not legacy)": was_older and not is_older,
+    }
+    fitting = ", ".join(change for change, differs in changes.items() if differs)
     message = f"the markers that were read do not lie as on the board that is described, but as with {fitting}"
     return FoundBoard({}, Reason(f"{message}. Set that, if it is the board's", Code.NO_BOARD))
 

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from measure.array_types import Array
 from measure.boards.corner_fit import Corner, CornerStart, Surface, crossing, fit_corners, quarter
 from measure.boards.find import find_board
-from measure.boards.lattice import Place, find_grid, grid_size, homography_steps
+from measure.boards.lattice import Place, find_grid, grid_of_any_count, grid_size, homography_steps
 from measure.boards.specs import (
     AprilGridSpec,
     ArucoSpec,
@@ -35,6 +35,7 @@ from measure.targets.sheets import fit_view_robustly
 
 _MIRROR = np.array([-1.0, 1.0])  # of column and row
 _SMALLEST_DOT_PX = 5.0  # px, diameter
+_LARGEST_DOT, _FEWEST_DOTS = 1 / 6, 12  # of a grid of any count: fraction of the picture's longer side; dots
 _FEWEST_WIDTHS = 8  # dots: four determine how the board lies
 _LARGEST_RATIO = 1.25  # of a dot's width to the given one: tone curve and ink change small ones by a tenth
 _NEAREST_DOTS = 8  # neighbours whose places and shapes predict a missing dot
@@ -105,6 +106,20 @@ def _measure_circle_grid(scan: Scan, spec: CircleGridSpec) -> BoardMeasurement:
     wrong_width = _width_contradiction({names[place]: fit for place, fit in disks.items() if not fit.reason}, spec)
     measured = BoardMeasurement(tuple(marks), notes=grid.notes, is_mirrored=is_mirrored, contradiction=wrong_width)
     return _unless_alone(scan, measured, f"grids of {grid_size(spec, 'dots')}", grid.others_px)
+
+
+def recognise_dots(scan: Scan) -> str:
+    """Options of `reseau calibrate` for the grid of dots that a scan shows; "" if it shows none."""
+    longest_px = _LARGEST_DOT * max(scan.width_px, scan.height_px)
+    patches = disk_candidates(scan, DiskSearch((_SMALLEST_DOT_PX, max(2 * _SMALLEST_DOT_PX, longest_px))))
+    if len(patches) < _FEWEST_DOTS:
+        return ""
+    grid = grid_of_any_count(np.array([patch.center_px for patch in patches]), _appearances(patches))
+    if grid is None or grid[0] * grid[1] < _FEWEST_DOTS * (1 + grid[2]):
+        return ""
+    columns, rows, is_staggered = grid
+    kind, per_row = ("asymmetric-circle-grid", columns / 2) if is_staggered else ("circle-grid", columns)
+    return f"--kind {kind} --board {per_row:g}x{rows} --marker DIAMETER"
 
 
 def _width_contradiction(disks: Mapping[str, FittedDisk], spec: CircleGridSpec) -> str:

@@ -4,9 +4,10 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from html import escape
+from itertools import islice
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, get_args
@@ -21,6 +22,7 @@ from adjust.solution.result import Adjustment
 from adjust.validation import largest_sigma_mm
 from measure import MeasurementError, open_scan
 from measure.boards.find import fitting_board, recognise_board
+from measure.boards.measure import recognise_dots
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
 from pipeline.calibration import project_files
 from pipeline.calibration.intrinsics import (
@@ -30,6 +32,7 @@ from pipeline.calibration.intrinsics import (
     LensSetting,
     camera_intrinsics,
     choose_lens,
+    p_of_one_camera,
 )
 from pipeline.calibration.pictures import (
     FEWEST_PICTURES,
@@ -37,6 +40,7 @@ from pipeline.calibration.pictures import (
     CameraPictures,
     find_pictures,
     find_turns,
+    name_parts,
 )
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
@@ -51,6 +55,9 @@ from pipeline.workers import WorkOptions
 
 GENEROUS = 2.0  # factor on the unmodelled standard deviation, for lens models with larger misfit than the first
 FEWEST_CORNERS = 4  # corners for a space resection with redundancy
+MOST_LOOKED_AT = 6  # pictures in which a board that was not found is recognised: the first ones may not show it
+
+MOST_PARTITIONS, DIFFERENT = 3, 0.001  # of images by their names that are tried; p-value of one camera
 
 OUT = Path("calibration")
 LENSES: dict[str, LensSetting] = {"auto": "auto", **{model: model for model in get_args(LensModel)}}
@@ -67,6 +74,7 @@ class CalibrationResult(PlottedResult):
     files : written files, report and project last.
     adjustments : by camera.
     pixel_mm : side of a pixel in the adjustments.
+    mixed : by camera, which pictures differ from the others by their names and by what they show of the camera.
     """
 
     cameras: tuple[CameraIntrinsics, ...]
@@ -76,6 +84,7 @@ class CalibrationResult(PlottedResult):
     summary: Summary
     adjustments: Mapping[str, Adjustment]
     pixel_mm: float
+    mixed: Mapping[str, str] = field(default_factory=dict)
 
     def plots(self, camera: str = "") -> CameraPlots:
         """Plots of a camera, in px. Raises InputError for an unknown camera."""
@@ -111,7 +120,7 @@ class CalibrationResult(PlottedResult):
     def needs_review(self) -> bool:
         """Whether images were left out, or the adjustment or its check has a problem."""
         left_out = self.unreadable or self.not_calibrated or any(camera.left_out for camera in self.cameras)
-        return bool(left_out) or self.summary.verdict.exit_code != 0
+        return bool(left_out or self.mixed) or self.summary.verdict.exit_code != 0
 
     @property
     def report(self) -> Path:
@@ -126,7 +135,7 @@ class CalibrationResult(PlottedResult):
             "cameras": [camera.as_json() for camera in self.cameras],
             "unreadable": dict(self.unreadable),
             "not_calibrated": dict(self.not_calibrated),
-            "problems": [problem.what for problem in self.summary.verdict.problems],
+            "problems": [*self.mixed.values(), *(problem.what for problem in self.summary.verdict.problems)],
             "files": list(map(str, self.files)),
         }
 
@@ -140,6 +149,7 @@ class CalibrationResult(PlottedResult):
             lines.append("Pictures of other sizes or focal lengths are taken for other cameras'.")
         lines += [f"- {name} cannot be read: {why}" for name, why in self.unreadable.items()]
         lines += [f"- {camera} is not calibrated: {why}" for camera, why in self.not_calibrated.items()]
+        lines += [f"- {why}" for why in self.mixed.values()]
         for problem in self.summary.verdict.problems:
             lines += [f"- {problem.cause} {problem.detail}".rstrip(), f"  {problem.remedy}".rstrip()]
         lines += [str(file) for file in self.files if file != self.report]
@@ -183,6 +193,24 @@ class _CalibrationProject:
             )
         return adjustment, choice
 
+    def cameras_by_name(self, camera: CameraPictures, marks: Sequence[ComparatorPoint]) -> str:
+        """Sentence on the images of a camera that, by a part of their names, are of different cameras; else empty."""
+        project, shown = self.write(), {mark.image for mark in marks}
+        for parts in islice(name_parts([name for name in camera.images if name in shown]), MOST_PARTITIONS):
+            found = dict[str, CameraIntrinsics]()
+            for part, images in parts.items():
+                with suppress(AdjustmentError, InputError):
+                    adjustment = adjust_marks(project, [mark for mark in marks if mark.image in images])
+                    found[part] = camera_intrinsics(adjustment, camera, self.options.pixel_mm, {}, None, None, None)
+            p = p_of_one_camera(list(found.values()))
+            if len(found) == len(parts) and p < DIFFERENT:
+                each = "; ".join(f"*{part}*: {one.centre}" for part, one in found.items())
+                return (
+                    "Pictures with different names are of different cameras, or of one refocused between them: that "
+                    f"they are of one has p = {p:.1g} ({each} px). Give the pictures of one alone, then the others."
+                )
+        return ""
+
 
 def _calibrate_cameras(
     given: Sequence[Path], out: Path, options: project_files.CalibrationOptions, reporter: Reporter, workers: int | None
@@ -197,7 +225,7 @@ def _calibrate_cameras(
     marks = read_comparator(project.comparator)
     left_out = _left_out(pictures, marks)
     choices: dict[str, LensChoice | None] = {}
-    adjustments, not_calibrated = dict[str, Adjustment](), dict[str, str]()
+    adjustments, not_calibrated, mixed = dict[str, Adjustment](), dict[str, str](), dict[str, str]()
     with reporter.stage("calibrating") as count:
         for done, camera in enumerate(pictures.cameras, 1):
             count(camera.name, done, len(pictures.cameras))
@@ -206,6 +234,8 @@ def _calibrate_cameras(
                 adjustments[camera.name], choices[camera.name] = written.adjust_camera(camera, own, left_out)
             except (AdjustmentError, InputError) as error:
                 not_calibrated[camera.name] = str(error)
+            if several := written.cameras_by_name(camera, own):
+                mixed[camera.name] = several
     if not adjustments:
         raise InputError(_nothing(pictures, left_out, not_calibrated, options.board))
     written.pictures, names = written.pictures.select(adjustments)
@@ -231,7 +261,7 @@ def _calibrate_cameras(
         write_atomically(path, text)
     files = (*texts, project.report_path, project.path)
     return CalibrationResult(
-        tuple(found), pictures.unreadable, not_calibrated, files, summary, adjustments, options.pixel_mm
+        tuple(found), pictures.unreadable, not_calibrated, files, summary, adjustments, options.pixel_mm, mixed
     )
 
 
@@ -292,16 +322,18 @@ def _nothing(
     """Reason why no camera is calibrated."""
     number = sum(len(camera.images) for camera in pictures.cameras)
     if len(left_out) == number:
-        first, shown = pictures.cameras[0].images[0], ""
-        found = f"the board was found in none of {counted(number, 'picture')}"
-        with suppress(MeasurementError), open_scan(pictures.files[first]) as scan:
-            if options := board.differing_options(fitting_board(scan, board.spec)):
-                return f"{found}: the markers of {first} lie as with {options}. Give that if it is the board's."
-            shown = recognise_board(scan)
+        found, shown = f"the board was found in none of {counted(number, 'picture')}", ""
+        for name in pictures.cameras[0].images[:MOST_LOOKED_AT]:
+            with suppress(MeasurementError), open_scan(pictures.files[name]) as scan:
+                if options := board.differing_options(fitting_board(scan, board.spec)):
+                    return f"{found}: the markers of {name} lie as with {options}. Give that if it is the board's."
+                if shown := recognise_dots(scan) or recognise_board(scan):
+                    shown = f": what {name} shows fits {shown}"
+                    break
         return (
             f"{found}; of most: {_most_common(left_out.values())}. "
             "Check --board (inner corners of a chessboard, not squares), --kind, --dictionary, --first-id, and that "
-            f"the board is in the picture{shown and f': what {first} shows fits {shown}'}."
+            f"the board is in the picture{shown}."
         )
     if len(pictures.cameras) > 1 and all(len(camera.images) < FEWEST_PICTURES for camera in pictures.cameras):
         sizes = listed([f"{camera.width_px} x {camera.height_px} px" for camera in pictures.cameras])

@@ -1,6 +1,6 @@
 """Intrinsics of a calibrated digital camera in pixels, with standard deviations and the data they are based on."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any, Literal
@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from rich.console import Console
 from rich.table import Column, Table
+from scipy.special import fdtrc
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Distortion, Prior
@@ -170,11 +171,16 @@ class CameraIntrinsics:
     def is_fisheye(self) -> bool:
         return self.family == "opencv_fisheye"
 
-    def __repr__(self) -> str:
-        centre = ", ".join(
+    @property
+    def centre(self) -> str:
+        """fx, fy, cx, cy with their standard deviations."""
+        return ", ".join(
             f"{name} {each.value:.2f} ± {each.sigma:.2f}" for name, each in self.values.items() if name in CENTRE
         )
-        return f"{self.pictures.name}: {centre} px, {counted(self.used, 'picture')}, rms {self.rms_px:.3f} px a point"
+
+    def __repr__(self) -> str:
+        pictures = counted(self.used, "picture")
+        return f"{self.pictures.name}: {self.centre} px, {pictures}, rms {self.rms_px:.3f} px a point"
 
     def as_json(self) -> dict[str, Any]:
         values = {name: each.as_json() for name, each in self.values.items()}
@@ -316,6 +322,18 @@ def camera_intrinsics(
         pitch_um=pitch_um,
         check=check,
     )
+
+
+def p_of_one_camera(cameras: Sequence[CameraIntrinsics]) -> float:
+    """p-value of calibrations by different images that fx, fy, cx, cy are those of one camera. Their covariances come
+    from few images, so that it is an F test."""
+    values = np.array([[camera.values[name].value for name in CENTRE] for camera in cameras])
+    weights = np.linalg.pinv(np.array([camera.covariance[:4, :4] for camera in cameras]), hermitian=True)
+    mean = np.linalg.pinv(weights.sum(axis=0), hermitian=True) @ np.einsum("cij,cj->i", weights, values)
+    count = len(CENTRE) * (len(cameras) - 1)
+    square = float(np.einsum("ci,cij,cj->", values - mean, weights, values - mean))
+    images = sum(camera.used for camera in cameras) - len(cameras)
+    return float(fdtrc(count, images, square / count)) if count and images > 0 else 1.0
 
 
 def _pixels(calibration: PixelCalibration) -> dict[str, float]:

@@ -1,6 +1,7 @@
 """Pictures of a digital camera: the files, their sizes, and quarter turns between them."""
 
 import os
+import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -32,6 +33,7 @@ from pipeline.text.files import SCAN_ENDINGS, names_below
 _Kind = tuple[int, int, float | None]  # width, height, focal length
 QUARTERS_DEG = (90, 270)
 TURNS_BY_TAG = {6: 90, 8: 270}  # Exif's Orientation of images that viewers turn back
+MOST_GROUPS, FEWEST_IN_GROUP = 8, 4  # of images by their names; images for a calibration with standard deviations
 PLAIN = 20.0  # twice the log-likelihood ratio; odds of e to the 10
 FEWEST_PICTURES = 3  # of a flat board with known turns, needed for principal distance and principal point
 
@@ -158,6 +160,20 @@ def _names(cameras: Sequence[_Kind]) -> list[str]:
         parts += ["no-focal-length" if focal is None else f"{focal:g}mm"] if len(focals) > 1 else []
         names.append("camera-" + "-".join(parts))
     return names
+
+
+def name_parts(images: Iterable[str]) -> Iterator[Mapping[str, list[str]]]:
+    """Partitions of images by a part of their names, a number or what stands beside numbers, as in left01 or cam2_01:
+    those into few groups of enough images."""
+    parts, earlier = {name: re.findall(r"\d+|\D+", name) for name in images}, list[list[list[str]]]()
+    for place in range(min(map(len, parts.values()), default=0)):
+        groups = defaultdict[str, list[str]](list)
+        for name, own in parts.items():
+            groups[own[place]].append(name)
+        is_apart = 1 < len(groups) <= MOST_GROUPS and min(map(len, groups.values())) >= FEWEST_IN_GROUP
+        if is_apart and [*groups.values()] not in earlier:
+            earlier.append([*groups.values()])
+            yield groups
 
 
 def find_turns(project: Project, marks: Sequence[ComparatorPoint], camera: CameraPictures) -> CameraPictures:

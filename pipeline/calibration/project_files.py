@@ -38,14 +38,15 @@ class BoardOptions:
 
     Attributes
     ----------
-    columns, rows : inner corners (chessboard), squares (charuco), markers (aprilgrid, aruco) or circles.
+    columns, rows : inner corners (chessboard), squares (charuco), markers (aprilgrid, aruco) or circles; 16.5 columns
+        of an asymmetric grid are rows of 17 and 16 circles in turn.
     spacing_mm : side of a square, or distance from one marker or circle to the next; of an asymmetric grid the distance
         of its rows, which is half the distance between two circles of a row.
     size_mm : of a marker or a circle.
     """
 
     kind: BoardKind
-    columns: int
+    columns: float
     rows: int
     spacing_mm: float
     size_mm: float | None = None
@@ -79,6 +80,8 @@ class BoardOptions:
                 keys |= {"first_id": self.first_id}
             case "circle-grid" | "asymmetric-circle-grid":
                 keys |= {"spacing_mm": self.spacing_mm, "diameter_mm": self._size}
+                if self.columns % 1:
+                    keys |= {"kind": "circle-grid", "columns": round(2 * self.columns), "asymmetric": True}
         return "\n".join(["[targets]", *table_lines(keys), ""])
 
     @property
@@ -142,13 +145,14 @@ def board_options(
             raise InputError(
                 f"{option}: a {kind} has none. Leave it out, or name the board's kind: --kind charuco, say."
             )
-    counts = re.fullmatch(r"(\d{1,3}) ?[x×*] ?(\d{1,3})", board.strip(), flags=re.IGNORECASE)
-    if counts is None or not all(1 <= int(each) <= MOST for each in counts.groups()):
+    half = r"(?:\.5)?" if kind == "asymmetric-circle-grid" else ""
+    counts = re.fullmatch(rf"(\d{{1,3}}{half}) ?[x×*] ?(\d{{1,3}})", board.strip(), flags=re.IGNORECASE)
+    if counts is None or not all(1 <= float(each) <= MOST for each in counts.groups()):
         raise InputError(f"--board {board}: must be two counts of 1 to {MOST}, COLUMNSxROWS, such as 9x6.")
     size_mm = None if marker is None else _length_mm("--marker", marker)
-    columns, rows = map(int, counts.groups())
+    columns, rows = (float(each) if "." in each else int(each) for each in counts.groups())
     spacing_mm = _length_mm("--square", square)
-    found = BoardOptions(kinds[kind], columns, rows, spacing_mm, size_mm, dictionary, legacy, first_id)
+    found = BoardOptions(kinds[kind], columns, int(rows), spacing_mm, size_mm, dictionary, legacy, first_id)
     try:
         _ = found.spec
     except ValueError as error:

@@ -618,7 +618,26 @@ def test_the_markers_tell_the_layout_of_a_charuco_board(legacy: bool) -> None:
         np.testing.assert_allclose(corner.center_px, (39.5 + 20 * column, 39.5 + 20 * row), atol=0.5)
     refused = find_charuco(picture, replace(spec, legacy=not legacy))
     assert not refused.corners
-    assert f"but as with legacy = {str(legacy).lower()}" in refused.reason
+    assert f"but as with the {'older layout (legacy)' if legacy else 'newer layout (not legacy)'}." in refused.reason
+
+
+def test_corners_between_markers_in_a_sharpened_picture() -> None:
+    """Edges have less blur than none there, and steps along them overshoot: 9 of 22 corners had not been fitted, and
+    others lay up to 0.5 px off. True places by the affinity that turns OpenCV's own drawing."""
+    spec, fine = specs.CharucoSpec("5X5_250", 7, 5, 20.0, 15.0), 8
+    drawing = charuco_board(spec).generateImage((180 * fine, 140 * fine), marginSize=20 * fine)
+    turn = cv2.getRotationMatrix2D((90 * fine - 0.5, 70 * fine - 0.5), 7.0, 0.9)
+    turned = cv2.warpAffine(drawing.astype(np.float32), turn, (180 * fine, 140 * fine), borderValue=(255,))
+    picture = 40 + 0.6 * turned.reshape(140, fine, 180, fine).mean(axis=(1, 3))
+    sharpened = 2 * picture - cv2.GaussianBlur(picture, (0, 0), 1.0)
+    noisy = np.clip(sharpened + np.random.default_rng(2).normal(0.0, 2.0, picture.shape), 0, 255)
+    read = [mark for mark in measure_board(draw.make_scan(noisy, 255), spec).marks if mark.center_px is not None]
+    row, column = np.divmod([int(mark.point[1:]) for mark in read], 6)
+    on_drawing = np.stack([20 * fine * (column + 2) - 0.5, 20 * fine * (row + 2) - 0.5, np.ones(len(read))])
+    off_px = np.array([mark.center_px for mark in read]) - ((turn @ on_drawing).T + 0.5) / fine + 0.5
+    assert len(read) >= 20
+    assert {mark.status for mark in read} == {Status.MEASURED}
+    assert np.hypot(*off_px.T).max() < 0.06
 
 
 def test_a_charuco_board_of_which_one_line_of_corners_is_visible_is_not_placed() -> None:
@@ -640,20 +659,20 @@ def test_exchanged_counts_and_another_first_number_at_once() -> None:
     spec = specs.CharucoSpec("4X4_50", 5, 4, 32.0, 24.0, first_id=9)
     board = find_charuco(generated(spec), replace(spec, columns=4, rows=5, first_id=0))
     assert not board.corners
-    assert "but as with columns = 5, rows = 4, first_id = 9." in board.reason
+    assert "but as with 5 columns, 4 rows, first marker 9." in board.reason
     inner = find_charuco(generated(spec), replace(spec, columns=4, rows=3))
-    assert "but as with columns = 5, rows = 4." in inner.reason
+    assert "but as with 5 columns, 4 rows." in inner.reason
     aruco = specs.ArucoSpec("4X4_50", 4, 3, 20.0, 8.0, first_marker=5)
     picture = cv2.aruco.GridBoard((4, 3), 20.0, 8.0, specs.aruco_dictionary("4X4_50"), np.arange(5, 17))
     drawing = np.asarray(picture.generateImage((344, 264), marginSize=20), np.uint8)
     read = find_aruco(drawing, replace(aruco, columns=3, rows=4, first_marker=0))
-    assert "but as with columns = 4, rows = 3, first_marker = 5." in read.reason
+    assert "but as with 4 columns, 3 rows, first marker 5." in read.reason
     assert len(find_aruco(drawing, aruco).corners) == 48
 
 
 @parametrize_with_studies(
     ("columns", "rows", "words"),
-    [(4, 2, "rows = 3"), (3, 3, "columns = 4"), (6, 5, "columns = 4, rows = 3")],
+    [(4, 2, "3 rows"), (3, 3, "4 columns"), (6, 5, "4 columns, 3 rows")],
     quick=(0, 2),
 )
 def test_markers_on_a_board_of_another_count_name_it(columns: int, rows: int, words: str) -> None:
@@ -681,12 +700,12 @@ def test_one_marker_more_is_no_board_of_another_count() -> None:
 
 @parametrize_with_studies("first", [5, 0])
 def test_markers_counted_from_below_are_those_of_an_aprilgrid(first: int) -> None:
-    """And the other way round: the kind that fits is named, with its own keys."""
+    """And the other way round: the kind that fits is named."""
     grid = specs.AprilGridSpec("APRILTAG_36h11", 4, 3, 40.0, 12.0, first_marker=first)
     above = specs.ArucoSpec("APRILTAG_36h11", 4, 3, 40.0, 12.0, first_marker=first)
     for drawn, taken, words in (
-        (grid, above, 'but as with kind = "aprilgrid", spacing = 0.3.'),
-        (above, grid, 'but as with kind = "aruco", gap_mm = 12.'),
+        (grid, above, "but as with kind aprilgrid and gaps of 12 mm."),
+        (above, grid, "but as with kind aruco and gaps of 12 mm."),
     ):
         picture = np.full((3 * 52 + 40, 4 * 52 + 40), 255, np.uint8)
         for row, column in np.ndindex(3, 4):
@@ -706,7 +725,7 @@ def test_charuco_numbers_that_begin_later(given: int) -> None:
     spec = specs.CharucoSpec("4X4_50", 6, 5, 32.0, 24.0, first_id=6)
     picture = generated(spec)
     assert len(find_charuco(picture, spec).corners) == 20
-    assert "but as with first_id = 6" in find_charuco(picture, replace(spec, first_id=given)).reason
+    assert "but as with first marker 6" in find_charuco(picture, replace(spec, first_id=given)).reason
 
 
 def test_a_charuco_corner_is_held_against_the_markers_next_to_it() -> None:
@@ -736,7 +755,7 @@ def test_a_grid_of_april_tags_has_its_corners_at_the_junctions(turn_deg: float, 
     assert np.abs(errors.mean(axis=0)).max() < 0.008
     assert all("junction_col_px" in mark.quality for mark in board.marks)
     other = measure_board(draw.make_scan(picture), replace(APRIL_GRID, first_marker=0))
-    assert "but as with first_id = 5" in other.reason
+    assert "but as with first marker 5" in other.reason
     assert recognise_board(draw.make_scan(picture)) == "--kind aprilgrid --board COLUMNSxROWS"
 
 

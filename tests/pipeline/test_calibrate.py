@@ -37,7 +37,7 @@ from pipeline.archive.cross_scan_checks import check_repeated_views
 from pipeline.calibration import calibrate_stage, intrinsics
 from pipeline.calibration.calibrate_stage import CalibrationResult
 from pipeline.calibration.intrinsics import LensChoice, LensModel, choose_lens
-from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures
+from pipeline.calibration.pictures import BoardPictureFiles, CameraPictures, find_pictures, name_parts
 from pipeline.calibration.project_files import CalibrationOptions, board_options, check_folder, write_project
 from pipeline.files.project_file import Project
 from pipeline.files.project_tables import AdjustSettings
@@ -52,6 +52,7 @@ Array = NDArray[np.float64]
 
 BOARD = ChessboardSpec(7, 5, 20.0)
 CHESSBOARD = board_options("chessboard", "7x5", "20mm")
+CHESSBOARD_PIXEL_MM = CalibrationOptions(CHESSBOARD).pixel_mm
 SIZE_PX, FOCAL_PX, CENTER_PX = (400, 320), 520.0, (203.0, 157.0)
 PITCH_MM = 0.01
 MATRIX = np.array([[FOCAL_PX, 0.0, CENTER_PX[0]], [0.0, FOCAL_PX, CENTER_PX[1]], [0.0, 0.0, 1.0]])
@@ -458,6 +459,38 @@ def test_what_is_wrong_with_pictures_is_given_in_pixels(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize("apart_px", [0.0, 12.0])
+def test_pictures_of_two_cameras_are_told_apart_by_their_names(apart_px: float, tmp_path: Path) -> None:
+    """They had been called distorted each in its own way. The second camera's principal point lies 12 px to the left;
+    names that differ where cameras do not are nothing to speak of."""
+    _, marks = simulated_marks(tmp_path)
+    shift_mm = np.array([apart_px * CHESSBOARD_PIXEL_MM, 0.0])
+    both = [replace(mark, image=f"left{mark.image}") for mark in marks]
+    both += [replace(mark, image=f"right{mark.image}", xy_mm=present(mark.xy_mm) - shift_mm) for mark in marks]
+    images = tuple(dict.fromkeys(mark.image for mark in both))
+    files = {}
+    for name in images:
+        files[name] = tmp_path / f"{name}.png"
+        files[name].touch()
+    camera = CameraPictures("camera", *SIZE_PX, None, images)
+    written = calibrate_stage._CalibrationProject(
+        BoardPictureFiles(files, (camera,), {}), tmp_path, CalibrationOptions(CHESSBOARD), {"camera": "opencv4"}
+    )
+    said = written.cameras_by_name(camera, both)
+    assert bool(said) == bool(apart_px)
+    assert not said or re.search(r"\*leftp\*: .* cx 20[23]\.\d.*\*rightp\*: .* cx 19[01]\.\d", said)
+
+
+def test_parts_of_names_that_make_groups() -> None:
+    """Folders, sides and numbers of cameras; numbers of pictures and single ones make none."""
+    pairs = [f"{side}{number:02}" for number in range(5) for side in ("left", "right")]
+    assert [list(each) for each in name_parts(pairs)] == [["left", "right"]]
+    folders = [f"cam{camera}/shot{number}_{camera}" for camera in (0, 1) for number in range(4)]
+    assert [list(each) for each in name_parts(folders)] == [["0", "1"]]
+    assert not list(name_parts([*(f"p{number}" for number in range(20)), "q1"]))
+    assert not list(name_parts([]))
+
+
 def test_a_lens_that_does_not_suit_at_all_is_adjusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its errors of more than 2 % of the marks' extent were refused as a wrong unit, before a fisheye was tried."""
     monkeypatch.setattr("adjust.solution.adjustment._drop_contradicting", lambda network, first, *_: first)
@@ -482,6 +515,29 @@ def test_where_no_board_is_found_the_message_names_what_the_first_picture_shows(
     images = [name for camera in pictures.cameras for name in camera.images]
     message = calibrate_stage._nothing(pictures, dict.fromkeys(images, "no marker was read"), {}, CHESSBOARD)
     assert message.endswith("that the board is in the picture: what p0 shows fits --board 7x5.")
+
+
+@pytest.mark.parametrize(
+    ("width", "staggered", "given"),
+    [
+        (8, True, "--kind asymmetric-circle-grid --board 4x7"),
+        (9, True, "--kind asymmetric-circle-grid --board 4.5x7"),
+        (8, False, "--kind circle-grid --board 8x7"),
+    ],
+)
+def test_dots_are_named_whichever_picture_shows_them(width: int, staggered: bool, given: str, tmp_path: Path) -> None:
+    """Dots had been named as a chessboard of some count, and pictures after one without a board were not looked at."""
+    Image.new("L", (480, 360), 200).save(tmp_path / "p0.png")
+    board = np.full((720, 960), 220, np.uint8)
+    for row, column in np.ndindex(7, width):
+        if not staggered or (row + column) % 2 == 0:
+            cv2.circle(board, (120 + 80 * column, 120 + 80 * row), 46 if staggered else 26, (30,), -1)
+    tilt = np.array([[0.5, 0.03, 0.0], [0.0, 0.5, 0.0], [0.0, 1e-4, 1.0]])
+    picture = cv2.warpPerspective(cv2.GaussianBlur(board, (0, 0), 2.0), tilt, (480, 360), borderValue=(220,))
+    Image.fromarray(picture).save(tmp_path / "p1.png")
+    pictures = find_pictures([tmp_path], tmp_path / "o")
+    message = calibrate_stage._nothing(pictures, dict.fromkeys(("p0", "p1"), "no board"), {}, CHESSBOARD)
+    assert message.endswith(f"what p1 shows fits {given} --marker DIAMETER.")
 
 
 @pytest.mark.parametrize(
@@ -531,6 +587,9 @@ def test_boards_as_project_files_have_them() -> None:
     steps = np.array(list(circles.object_points().values()))[:, :2] / 25.4
     of_opencv = [(2 * column + row % 2, 10 - row) for row in range(11) for column in range(4)]
     np.testing.assert_allclose(steps, of_opencv)
+    rows = board("asymmetric-circle-grid", "2.5x3", "1in", "10mm")
+    assert [name for name in rows.object_points() if name.startswith("r1")] == ["r1c1", "r1c3"]
+    assert len(rows.object_points()) == 3 + 2 + 3
     aruco = board("aruco", "3x2", "40mm", "30mm", "4X4_50", first_id=6)
     assert (aruco.marker_mm, aruco.gap_mm, aruco.first_marker) == (30.0, 10.0, 6)
     april = board("aprilgrid", "6x6", "114.4mm", first_id=3)
