@@ -34,7 +34,7 @@ _PAIRS = 60  # pairs of marks from which hypotheses are made
 _FAR = 0.4  # fraction of the largest distance of two marks: nearer pairs determine rotation and scale poorly
 _KEPT = 12  # placements of a pose that are refined
 _STEPPED = 3  # best placements that are shifted along a lattice of marks
-_AS_GOOD = 0.9  # of the best score: a lattice whose outer line is not visible has the same under other names
+AS_GOOD = 0.9  # of the best score: a lattice whose outer line is not visible has the same under other names
 _NEIGHBOURS = 4  # nearest marks, which give the steps of a lattice
 _ALIKE = 0.5  # fraction of the marks that a step maps to others: above it they form a lattice
 _SAME_PX = 10  # px of the reduced scan: the shift up to which two placements are the same; a mark is some 14 px large
@@ -188,6 +188,7 @@ class PlacementSearch:
     ----------
     steps_mm : (n, 2) steps of a lattice of marks; none if they form no lattice.
     tolerance_px : deviation allowed to a mark, px of the reduced scan.
+    same_mm : distance up to which marks of two orientations coincide.
     kinds : by orientation, the kind of template of every mark.
     placements : by orientation. An orientation with equal marks at the places of an earlier one gets the placements of
         that one, converted.
@@ -210,6 +211,7 @@ class PlacementSearch:
         self.pitch_mm, self.pitch = pitch_mm, np.asarray(pitch_mm)
         self.steps_mm = lattice_steps_mm(self.camera_mm, bounds.misfit_mm)
         self.tolerance_px = max(bounds.misfit_mm / float(self.pitch.mean()) / responses.reduction, _LEAST_TOLERANCE_PX)
+        self.same_mm = _SAME * bounds.misfit_mm
         self.kinds: dict[str, tuple[int, ...]] = {}
         self.placements: dict[str, list[Placement]] = {}
         self.distinct: list[str] = []
@@ -219,7 +221,7 @@ class PlacementSearch:
         misfit_mm = self.bounds.misfit_mm
         same, similar = (
             next((known for known in self.kinds.items() if same_picture(self.marks, known, (pose, kinds), mm)), None)
-            for mm in (_SAME * misfit_mm, misfit_mm)
+            for mm in (self.same_mm, misfit_mm)
         )
         if same:
             known = self.placements[same[0]] if self._every_pose else ()
@@ -298,7 +300,7 @@ class _Constellation:
             scores = self._scores(self.search.tolerance_px, all_scales, tried.ravel())[0]
             best = scores.reshape(tried.shape).argmax(axis=1)
             offset = tried[np.arange(len(best)), best]
-        kept = scores >= _AS_GOOD * scores.max()
+        kept = scores >= AS_GOOD * scores.max()
         kept[:: len(steps)] = True  # not a step farther
         return all_scales[kept], tried.ravel()[kept]
 

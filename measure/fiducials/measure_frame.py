@@ -102,7 +102,7 @@ _SAME_PX = 1.0  # px between two places of one faint mark at most; each is more 
 _EXTREMES = (0.5, 99.5)  # percentiles of the grey values taken as darkest and lightest
 _SURROUND = 6.0  # times a mark's own extent: enough of the scan for its darkest and lightest grey values
 RANDOM_PLACES = 64  # compared beside the marks: enough to test three marks found of four
-_OFFSETS = (2.5, 4.5)  # in search radii: beyond the response of the mark itself
+_OFFSETS = (2.5, 4.5)  # in search radii, more for large marks: beyond the response of the mark itself
 _LEAST_FALSE_ALARMS = 1e-300  # has a logarithm
 FITTED_PX = 3.0  # px, largest distance between the fitted place and the correlation peak
 _STRAINED = 1 / 3  # fraction of a mark's standard deviation: a larger strain error raises it by more than a twentieth
@@ -226,6 +226,11 @@ class Frame:
     def peak(self, index: int, place_px: Array, radius_px: float, blur_px: float) -> PeakSearch:
         """Highest correlation of a mark, by index, rendered with a blur, within a radius of a place in the scan."""
         return PeakSearch(self.scan, self.prediction(index, radius_px).shift_to(place_px), blur_px)
+
+    def response_px(self, index: int) -> float:
+        """Distance from which a search does not respond to a mark, by index, itself."""
+        low, high = extent_px(self.layout.marks[index].mark, self.prediction(index, 0.0).pixel_from_mark)
+        return self.first_search_px + float((high - low).max()) / 2
 
     def fitted_peaks(self, places_px: Mapping[int, Array]) -> tuple[dict[int, float], float]:
         """Correlations of marks, by index, about the places where they were fitted, and the blur of their template:
@@ -541,8 +546,9 @@ def random_matches(frame: Frame, indices: Iterable[int]) -> tuple[dict[int, int]
     angles = np.arange(8) * np.pi / 4
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     size = np.array([frame.scan.width_px, frame.scan.height_px])
+    unit_px = {index: max(radius_px, frame.response_px(index) / _OFFSETS[0]) for index in inside}
     every = [
-        (index, np.asarray(frame.predicted_px[index] + off * radius_px * direction))
+        (index, np.asarray(frame.predicted_px[index] + off * unit_px[index] * direction))
         for off in _OFFSETS
         for direction in directions
         for index in inside

@@ -549,6 +549,15 @@ def _distinct(views: Sequence[MarkImage]) -> tuple[list[MarkImage], list[int]]:
     return kinds, index
 
 
+def picture_kinds(
+    marks: Sequence[Mark], poses: Sequence[str], scan_from_up: Array, blur_px: float
+) -> dict[str, list[int]]:
+    """Kind of picture of every mark by orientation; equal ones differ nowhere visibly."""
+    shown = [OrientedMark(mark, UP_FROM_CAMERA[pose]) for pose in poses for mark in marks]
+    _, kinds = _distinct(Drawings(marks, scan_from_up, blur_px).views(shown, 0))
+    return {pose: kinds[number * len(marks) :][: len(marks)] for number, pose in enumerate(poses)}
+
+
 def _excess(misfits: Array, areas: Mask) -> Array:
     """(n,) excess of misfits (n, size, size) over the best one's, over the area common to both."""
     counts = areas.sum(axis=(1, 2)).clip(min=1)

@@ -21,7 +21,7 @@ from measure.array_types import Array
 from measure.detection.correlation import CLOSE, GRAINY, WIDE, Surroundings
 from measure.detection.significance import chance_of_marks, share_of_places
 from measure.fiducials.camera_recognition import find_pitch_mm
-from measure.fiducials.constellation import FREE_MARKS, NARROW, Placement, distinct_places
+from measure.fiducials.constellation import AS_GOOD, FREE_MARKS, NARROW, Placement, distinct_places, same_picture
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA
 from measure.fiducials.measure_frame import (
     CHECKED,
@@ -34,7 +34,7 @@ from measure.fiducials.measure_frame import (
     rename_frame,
 )
 from measure.fiducials.options import FiducialOptions
-from measure.fiducials.scan_orientation import decide_scan_orientation
+from measure.fiducials.scan_orientation import decide_scan_orientation, picture_kinds
 from measure.fiducials.search import (
     FrameSearch,
     Hypotheses,
@@ -61,10 +61,11 @@ from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
 from measure.tone.curve import Tone
 
-# middle, given: under the prior belief about the scan, in windows about its middle or in all of it; oblique: with a
+# middle, given: under the prior belief about the scan, in windows about its middle or in all of it; turned: in other
+# orientations that score as well at the same place, since reduced responses hardly tell them; oblique: with a
 # perspective, for film that was photographed obliquely; pitch: under other pitches; faint: with narrower surroundings
 # of the marks, since the frame's edge may mask a mark in wider ones, and then with those for marks in strong grain.
-Kind = Literal["middle", "given", "oblique", "pitch", "faint"]
+Kind = Literal["middle", "given", "turned", "oblique", "pitch", "faint"]
 Evaluated = tuple[float, Frame]  # expected number of false frames as good
 
 _MOST = 0.6  # fraction of a lattice's marks: at half its spacing up to 0.56 of them lie on others
@@ -82,6 +83,8 @@ _STRETCHES = np.linspace(-0.03, 0.03, 13)  # relative, of non-square pixels; a s
 _RARE_FRAMES, _FREQUENT_FRAMES = 1e-3, 1e6
 _MOST_COUNTED = 3  # marks at most to whose false-alarm rates the share at full resolution applies
 _APART = 2.0  # in search radii: beyond the response of a mark itself
+_BLUR_PX = 1.0  # px, of the drawings in which orientations are compared
+_LEAST_UNLIKE = 1e-6  # share of a mark's variance that its drawing leaves; has a logarithm
 _SURE = 12  # inliers from which the frame is no false alarm: specks do not agree so often
 
 
@@ -186,6 +189,7 @@ def list_stages(
         *([Stage("middle", given, options)] if in_windows else []),
         Stage("given", given, options),
         *(Stage("given", given, options, tone=tone) for tone in scan.tone.starting_curves),
+        Stage("turned", given, options),
         *([Stage("oblique", given, oblique, at_given=True)] if may_be_oblique else []),
         *(Stage("pitch", group, options) for group in others),
         *(
@@ -258,6 +262,9 @@ def _find_in_stages(
     pending = list(stages)
     while pending:
         stage = pending.pop(0)
+        if stage.kind == "turned":
+            found = _in_other_orientations(scan, layout, options, found, at_given)
+            continue
         if stage.is_unnecessary(found):
             continue
         result = at_given if stage.tone else search.placements(stage)
@@ -299,6 +306,43 @@ def _find_in_stages(
         return found
     # Its placements and frames would take up memory while a negative is searched for.
     return StageResult(misfit=found.misfit.reword(found.misfit + _what_to_do(found)))
+
+
+def _in_other_orientations(
+    scan: Scan, layout: FiducialLayout, options: FiducialOptions, found: StageResult, at_given: SearchResult
+) -> StageResult:
+    """Measure a frame that is not sure in the other orientations that score as well at its place."""
+    frame = found.frame
+    if frame is None or frame.is_sure or not at_given.placements:
+        return found
+    best = frame.placement if found.is_taken else at_given.placements[0]
+    start = frame.scan if found.is_taken else scan
+    turned = (measure_frame(start, layout, each, options) for each in _orientations_at(at_given, best, frame))
+    most = max((frame, *turned), key=_match)
+    return replace(found, frame=most, is_taken=True) if most.accepted and most is not frame else found
+
+
+def _orientations_at(result: SearchResult, best: Placement, frame: Frame) -> list[Placement]:
+    """Placements at the place of the best one in orientations with other pictures that score as well."""
+    marks, search = frame.layout.marks, result.searches[best.pitch_mm]
+    scan_from_up = np.diag((1.0, -1.0) / np.asarray(best.pitch_mm))
+    shown = {best.pose: best}
+    for other in result.placements:
+        if other.same_place(best) and other.score >= AS_GOOD * best.score:
+            shown.setdefault(other.pose, other)
+    kinds = picture_kinds([each.mark for each in marks], list(shown), scan_from_up, _BLUR_PX)
+    distinct = list[str]()
+    for own in kinds.items():
+        known = ((pose, kinds[pose]) for pose in distinct)
+        if not any(same_picture(marks, each, own, search.same_mm) for each in known):
+            distinct.append(own[0])
+    return [shown[pose] for pose in distinct[1:]]
+
+
+def _match(frame: Frame) -> tuple[bool, int, float]:
+    """Order of frames at one place: accepted ones, with more marks, that match their drawings better."""
+    unlike = [1 - fit.likeness**2 for fit in frame.inlier_fits.values()]
+    return frame.accepted, len(frame.inlier_fits), -float(np.log(np.maximum(unlike, _LEAST_UNLIKE)).sum())
 
 
 def measure_stage(

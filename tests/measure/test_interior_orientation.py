@@ -429,6 +429,45 @@ def test_marks_that_a_sharpened_scan_shows_far_wider_than_drawn_stand_out_from_r
     assert not doubt_frame(SearchResult(), frame)
 
 
+def test_random_places_lie_beyond_the_response_of_large_marks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Disks of 18 px, sought within fewer of their places: at 2.5 times that their own edges would match."""
+    disks = lay_out([MarkShape(dot(0.9), "light")] * 4, CORNERS, (16.0, 16.0))
+    frame, places = make_frame_chance(make_scan(picture(disks, "0")), disks), list[Array]()
+
+    def record(_frame: Frame, _index: int, place_px: Array, radius_px: float, _blur_px: float) -> Any:
+        if radius_px != steps.FITTED_PX:
+            places.append(place_px)
+        return SimpleNamespace(height=0.0, false_alarms=1.0)
+
+    monkeypatch.setattr(Frame, "peak", record)
+    steps.random_matches(frame, range(4))
+    apart_px = np.hypot(*(np.array(places)[:, None] - centers_px(disks, "0")).T)
+    assert apart_px.min() > frame.first_search_px + 0.95 * 0.9 * PX_PER_MM
+
+
+@pytest.mark.parametrize("uneven_mm", [0.6, 0.0])
+def test_a_frame_is_measured_in_the_orientations_that_score_as_well(
+    uneven_mm: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One mark of four lies 0.6 mm farther out: in the wrong orientation two are sought where they are not. Of a
+    symmetric frame no other orientation is measured."""
+    places = ((7.0 + uneven_mm, -7.0), *CORNERS[1:])
+    layout = lay_out([DOT] * 4, places, (16.0, 16.0))
+    scan, placements = make_scan(picture(layout, "180")), (placement("0"), placement("180"))
+    found = stages.StageResult(frame=measure_frame(scan, layout, placements[0], OPTIONS))
+    search = cast(Any, {placements[0].pitch_mm: SimpleNamespace(same_mm=0.04)})
+    if not uneven_mm:
+        monkeypatch.setattr(Frame, "is_sure", False)
+        monkeypatch.setattr(stages, "measure_frame", lambda *_: pytest.fail("it is measured again"))
+    taken = stages._in_other_orientations(scan, layout, OPTIONS, found, SearchResult(placements, search))
+    assert taken.is_taken == bool(uneven_mm)
+    assert taken.frame is not None
+    places_px = {index: fit.center_px for index, fit in taken.frame.inlier_fits.items()}
+    truth = centers_px(layout, "180" if uneven_mm else "0")
+    assert sorted(places_px) == [0, 1, 2, 3]
+    assert all(np.hypot(*(place - truth[index])) < 0.2 for index, place in places_px.items())
+
+
 def test_a_frame_that_chance_is_likelier_to_have_made_than_not_gives_no_observation() -> None:
     """Two marks of four: a similarity goes through any two."""
     grey = picture(DOTS, "0", hidden=1)
