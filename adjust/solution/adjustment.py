@@ -28,6 +28,7 @@ from adjust.quality.variance_components import added_variance
 from adjust.rank_defect.datum import held_as_known
 from adjust.solution.blunder_hypotheses import Trials, blunder_sentence
 from adjust.solution.coordinate_blunders import CoordinateBlunder, find_coordinate_blunders
+from adjust.solution.frame_hypotheses import frame_cause
 from adjust.solution.given_orientations import orientations_elsewhere, unlike_approximations
 from adjust.solution.options import Datum, Method, Options
 from adjust.solution.plausibility import check_plausibility
@@ -278,7 +279,14 @@ class _Solver:
         is_gross = found is first and first.converged and first.sigma0 > WHOLE
         if is_gross and any(each.kind == "affinities" for each in first.explanations):
             found = _leave_out_contradicting(part, first, readjust, agrees, several=True)
-        return replace(found, left_out={**left_out, **found.left_out})
+        contradicting = [] if found is first else [each for each in found.left_out if each not in first.left_out]
+        causes = {
+            frame: cause
+            for frame in contradicting[:TRIED]
+            if (rest := _leave_out(part, {*found.left_out} - {frame})) is not None
+            and (cause := frame_cause(rest, frame, found, self.trials))
+        }
+        return replace(found, left_out={**left_out, **found.left_out, **causes})
 
     def adjust_without_blind(self, part: Network, start: Approximations | None) -> Adjustment:
         """Adjust a network without the images in which some point has no image at the start.
@@ -524,15 +532,17 @@ def _leave_out_contradicting(
 def _is_of_single_marks(
     first: Adjustment, adjusted: Callable[[Network], Adjustment], agrees: Callable[[Adjustment], bool]
 ) -> bool:
-    """Whether the observations agree without gross errors of single marks, the smaller part of each image's."""
+    """Whether the observations agree without gross errors of single marks, no more than half of each image's fiducials
+    and of its targets."""
     network = first.network
     if not first.converged:
         return False
     is_left = np.ones(len(network.observations), dtype=bool)
     removed = snoop(first.run, Options(snooping=True, probabilities=first.probabilities)).removed
     is_left[[each.unit for each in removed if each.unit < len(is_left)]] = False
-    shares = np.bincount(network.observed_frames, is_left) / np.bincount(network.observed_frames).clip(1)
-    if is_left.all() or (shares[network.observed_frames] <= 0.5).any():
+    parts = 2 * network.observed_frames + network.observations.is_fiducial
+    shares = np.bincount(parts, is_left) / np.bincount(parts).clip(1)
+    if is_left.all() or (shares[parts] < 0.5).any():
         return False
     with suppress(AdjustmentError):
         return agrees(adjusted(replace(network, observations=network.observations.only(np.flatnonzero(is_left)))))

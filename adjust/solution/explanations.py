@@ -65,7 +65,7 @@ ENDING = ("groups", "distances", "affinities")  # after which nothing else is so
 OF_IMAGES = ("radial", "decentering", "bow", "pixels", "shear", "drift", "jump", "interior", "groups", "distances")
 OF_POINTS = ("board", "disks", "point")
 # Kinds of hypotheses with unknowns for every image, and the simpler ones that may explain as much.
-GENERAL = {"distances": ("drift", "groups"), "affinities": OF_IMAGES + OF_POINTS, "film": ("pixels",)}
+GENERAL = {"distances": ("drift", "groups"), "affinities": OF_IMAGES + OF_POINTS, "film": ("pixels", "single film")}
 GIVEN_LOOSELY = ("datum", "interior")  # groups of priors
 FEWEST = 30  # coordinates needed to test the distribution of residuals
 NOISE_LEVEL = 0.001  # significance level of each test of the noise hypothesis

@@ -144,13 +144,18 @@ BOW: tuple[Term, Term] = (({(0, 2): 1.0}, ZERO), (ZERO, {(2, 0): 1.0}))
 def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     """The lowest radial terms that a camera lacks, its next decentering terms, a bow, and affinity of the pixels.
 
-    Radial and decentering terms are those of its distortion family that are held, if there are any; all others are
-    polynomials of the image point in units of half the frame, so that their parameters are in mm at its edge.
+    Radial and decentering (Juhl: tangential) terms are those of its distortion family that are held, if there are any;
+    all others are polynomials of the image point in units of half the frame, so that their parameters are in mm at its
+    edge.
     """
     network, groups = run.problem.network, dict(family(camera.distortion.family).groups)
     positions, unknowns = run.problem.lens_positions(camera.name), run.problem.unknowns
     free = {name for name, at in positions.items() if unknowns.sigma[at] > 0.0}
-    held = {group: _held_terms(camera, group, free)[:TERMS_TOGETHER] for group in ("radial", "decentering")}
+    own_group = "tangential" if "tangential" in groups else "decentering"
+    held = {
+        "radial": _held_terms(camera, "radial", free)[:TERMS_TOGETHER],
+        "decentering": _held_terms(camera, own_group, free),
+    }
     images = [image for image in network.images if image.camera == camera.name]
     half_mm = camera.distortion.half_mm[0] or max(network.extent_by_image[image.name].half_mm for image in images)
     degree_of = {name: 3 + 2 * k for k, name in enumerate(groups.get("radial", ()))}
@@ -161,10 +166,8 @@ def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
     rows: list[tuple[str, Sequence[Term], Words]] = [
         ("radial", [radial((degree - 1) // 2) for degree in degrees], _too_simple_words(camera, "radial", pattern))
     ]
-    of_decentering = groups.get("decentering", ())
-    if not free.intersection(of_decentering[2:]):
-        words = _too_simple_words(camera, "decentering", "a tangential pattern (decentering)")
-        rows.append(("decentering", decentering(int(bool(free.intersection(of_decentering)))), words))
+    words = _too_simple_words(camera, own_group, "a tangential pattern (decentering)")
+    rows.append(("decentering", decentering(int(bool(free.intersection(groups.get("decentering", ()))))), words))
     rows.append(("bow", BOW, partial(_bow_words, camera)))
     if all(image.transformation == "none" for image in images):
         affinity: tuple[tuple[str, Words], ...] = (
@@ -410,24 +413,40 @@ def _jumps(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
 
 
 def film_deformations(run: Run) -> Iterator[ModelHypothesis]:
-    """Films that are deformed, each in its own way, by more than their transformation takes up."""
-    network = run.problem.network
+    """Films that are deformed, each in its own way, by more than their transformation takes up, and one such film."""
+    network, problem = run.problem.network, run.problem
     given = {image.transformation for image in network.images} - {"none"}
-    for kind in RICHER.get(min(given), ()) if len(given) == 1 else ():
-        films = [image.name for image in network.images if image.transformation in given]
-        images = tuple(replace(each, transformation=kind) if each.name in films else each for each in network.images)
-        problem = continue_problem(run, replace(network, images=images))
-        count = len(run.problem.unknowns.transformation[films[0]])
-        added = np.concatenate([problem.unknowns.transformation[name][count:] for name in films])
+    films = [image.name for image in network.images if image.transformation in given]
+    squares = (run.misfits.residual[: len(problem.image_numbers)] ** 2).sum(axis=1)
+    sizes = dict(zip((each.name for each in network.images), np.bincount(problem.image_numbers, squares), strict=False))
+    worst = max(films, key=lambda name: sizes.get(name, 0.0), default="")
+    kinds = RICHER.get(min(given), ()) if len(given) == 1 else ()
+    for kind, some in chain(((kind, films) for kind in kinds), ((kind, [worst]) for kind in kinds[-1:])):
+        images = tuple(replace(each, transformation=kind) if each.name in some else each for each in network.images)
+        larger = continue_problem(run, replace(network, images=images))
+        count = len(problem.unknowns.transformation[worst])
+        added = np.concatenate([larger.unknowns.transformation[name][count:] for name in some])
+        if some is films:
+            yield ModelHypothesis("film", partial(_film_words, min(given), kind), larger, added)
+        elif len(films) > 1:
+            best = partitions.Selection(choices=float(np.log(len(films))), contrasts=len(added) * len(films))
+            words = partial(_single_film_words, worst, min(given))
+            yield ModelHypothesis("single film", words, larger, added, selection=best)
 
-        def words(found: Estimate, kind: Transformation = kind) -> tuple[str, str]:
-            return (
-                f"The film deformation model, {min(given)}, is too simple: the films are deformed, each in its own "
-                f"way; a {kind} one explains {found.rms_um:.2g} µm rms",
-                f'Give transformation = "{kind}" under [adjust].',
-            )
 
-        yield ModelHypothesis("film", words, problem, added)
+def _film_words(given: Transformation, kind: Transformation, found: Estimate) -> tuple[str, str]:
+    return (
+        f"The film deformation model, {given}, is too simple: the films are deformed, each in its own way; a {kind} "
+        f"one explains {found.rms_um:.2g} µm rms",
+        f'Give transformation = "{kind}" under [adjust].',
+    )
+
+
+def _single_film_words(image: str, given: Transformation, _: Estimate) -> tuple[str, str]:
+    return (
+        f"The film of image {image} is deformed by more than its transformation ({given}) takes up, unlike the others",
+        "Look for stretched or torn film, or a frame of another camera, and scan it again or leave it out.",
+    )
 
 
 def _wrong_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
@@ -458,7 +477,7 @@ def _interior_orientations(run: Run, camera: Camera) -> Iterator[ModelHypothesis
             run, camera, dict.fromkeys(groups.names, camera.name + OTHERS), len(INTERIOR_NAMES)
         )
         shown = np.concatenate([added, problem.unknowns.camera[camera.name][: len(INTERIOR_NAMES)]])
-        words = partial(_group_words, f"{who} of camera {camera.name}")
+        words = partial(group_words, f"{who} of camera {camera.name}")
         yield ModelHypothesis("groups", words, problem, added, selection=groups, shown=shown)
     if (images := partitions.own_distances(run, equations)) is not None:
         others = {name: f"{camera.name}, {name}{OTHERS}" for name in images.names}
@@ -503,8 +522,8 @@ def _distance_words(camera: str, images: Sequence[str], found: Estimate) -> tupl
     )
 
 
-def _group_words(who: str, found: Estimate) -> tuple[str, str]:
-    """Describe two groups of images by the simplest differences of interior orientation that fit.
+def group_words(who: str, found: Estimate) -> tuple[str, str]:
+    """Describe images unlike the others by the simplest differences of interior orientation that fit.
 
     They are given in fractions of c: the pixels of digital cameras may have no size.
     """

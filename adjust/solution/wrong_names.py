@@ -7,7 +7,7 @@ affine transformation of the given fiducials to a frame shows which of them have
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations, product
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from scipy.spatial.distance import cdist
 
 from adjust.array_types import Array, Indices, Mask
 from adjust.initial_values.dlt import equations_by_point, linear_transformations, residual_squares
+from adjust.problem.camera import Fiducial
 from adjust.problem.network import Image, Network
 from adjust.problem.parameter import shortened
 
@@ -174,11 +175,8 @@ def exchanged_fiducials(network: Network) -> dict[str, str]:
             continue
         given_mm = np.array([prior.value for prior in priors]).reshape(-1, 2)
         order = _other_names(given_mm, network.observations.xy_mm[rows])
-        renamed = {names[k]: names[other] for k, other in enumerate(order) if k != other}
-        if len(renamed) == 2:
-            reasons[f"{' and '.join(sorted(renamed))} are exchanged"].append(image.frame)
-        elif renamed:
-            reasons[", ".join(f"{name} is {other}" for name, other in renamed.items())].append(image.frame)
+        if renamed := {names[k]: names[other] for k, other in enumerate(order) if k != other}:
+            reasons[renamed_words(renamed)].append(image.frame)
     return {
         frame: f"by the coordinates given, the fiducials of {shortened(some, NAMED)} have each other's names: {words}. "
         "Correct the names, or the coordinates in the camera file."
@@ -206,6 +204,28 @@ def _affine_misfit(given_mm: Array, xy_mm: Array) -> float:
     """Root mean square of what an affine transformation of centred places (n, 2) leaves of others."""
     rest = xy_mm - given_mm @ np.linalg.lstsq(given_mm, xy_mm, rcond=None)[0]
     return float(np.sqrt(np.mean(rest**2)))
+
+
+def renamed_words(renamed: Mapping[str, str]) -> str:
+    """Describe right names by the given ones."""
+    if len(renamed) == 2:
+        return f"{' and '.join(sorted(renamed))} are exchanged"
+    return ", ".join(f"{name} is {other}" for name, other in renamed.items())
+
+
+def turned_layouts(marks: Mapping[str, Fiducial]) -> Iterator[dict[str, str]]:
+    """Names of the fiducials, by their own, that lie where these do in a frame turned by quarters, or mirrored."""
+    if len(marks) < FEWEST_FIDUCIALS:
+        return
+    names = list(marks)
+    given_mm = np.array([(mark.x_mm.value, mark.y_mm.value) for mark in marks.values()])
+    given_mm -= given_mm.mean(axis=0)
+    for turned in TURNS:
+        distances = cdist(given_mm @ turned.T, given_mm)
+        order = linear_sum_assignment(distances)[1]
+        renamed = {names[k]: names[other] for k, other in enumerate(order) if k != other}
+        if renamed and distances[range(len(order)), order].max() < LARGE * np.ptp(given_mm):
+            yield renamed
 
 
 class TransformedField(NamedTuple):

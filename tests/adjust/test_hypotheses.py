@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import faults
@@ -16,8 +17,9 @@ from adjust import Adjustment, AdjustmentError, Distortion, Network, Observation
 from adjust.functional_model.rotation import rotation_from_angles
 from adjust.problem.problem import number_reduced
 from adjust.quality.critical_values import Probabilities
-from adjust.solution.adjustment import adjust_unmodelled
+from adjust.solution.adjustment import _is_of_single_marks, _Solver, adjust_unmodelled
 from adjust.solution.explanations import explain
+from adjust.solution.frame_hypotheses import frame_cause
 from adjust.solution.model_hypotheses import film_deformations, model_hypotheses
 from adjust.solution.result import adjust_problem
 
@@ -799,10 +801,10 @@ def test_images_with_another_ones_camera_are_named(moved: str, words: str, apart
 
 
 def test_richer_film_models_cost_the_unknowns_that_they_add() -> None:
-    """Two of a film from a similarity to an affine transformation, four to a projective one."""
+    """Two of a film from a similarity to an affine transformation, four to a projective one, as of a single film."""
     run = adjust(faults.BLUNDERS["sheared films held rigid"].spoil(faults.blunder_network(0))).run
     films = len(run.problem.network.images)
-    assert [len(each.added) for each in film_deformations(run)] == [2 * films, 4 * films]
+    assert [len(each.added) for each in film_deformations(run)] == [2 * films, 4 * films, 4]
 
 
 @parametrize_with_studies("options", [Options(), Options(robust="igg3")], quick=(1,))
@@ -965,3 +967,82 @@ def _check(result: Adjustment) -> None:
     assert result.converged
     assert result.sigma0 == pytest.approx(1.0, abs=0.3)
     assert not result.explanations
+
+
+def _bent(given: Network, image: str, off: float) -> Network:
+    """With the film of an image bent, by that part of x at 100 mm, in both coordinates."""
+    xy_mm = given.observations.xy_mm
+    is_bent = (np.array(given.observations.image) == image)[:, None]
+    return nets.set_observations(given, xy_mm=xy_mm * np.where(is_bent, 1.0 + off * xy_mm[:, :1] / 100.0, 1.0))
+
+
+def test_one_film_that_is_deformed_otherwise_is_named_alone() -> None:
+    """All films had been called deformed."""
+    result = adjust(_bent(faults.blunder_network(0), "f2", 3e-4))
+    (found,) = result.explanations
+    assert found.cause.startswith("The film of image f2 is deformed by more than its transformation (affine) takes up")
+    assert (result.suspects, result.left_out) == ((), {})
+
+
+def _in_a_mirror(given: Network, image: str) -> Network:
+    """With the fiducials of an image named as in a mirror."""
+    other, rows = {"1": "2", "2": "1", "3": "4", "4": "3"}, given.observations
+    marks = zip(rows.image, rows.point, rows.kind, strict=True)
+    return nets.set_observations(
+        given, point=tuple(other.get(p, p) if (i, k) == (image, "fiducial") else p for i, p, k in marks)
+    )
+
+
+@pytest.mark.study
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (_in_a_mirror, "the fiducials of image f2 have each other's names: 1 is 2, 2 is 1, 3 is 4, 4 is 3"),
+        (partial(_bent, off=0.003), "the film of image f2 is deformed by more than its transformation (affine)"),
+    ],
+)
+def test_a_frame_that_contradicts_the_others_is_left_out_with_its_cause(
+    spoil: Callable[[Network, str], Network], reason: str
+) -> None:
+    """ "Another size, pitch, zoom or camera" had been possible."""
+    result = adjust(spoil(faults.blunder_network(11), "f2"))
+    assert result.left_out["f2"].startswith(reason)
+    assert result.sigma0 < 1.2
+
+
+def test_names_of_a_mirrored_frame_are_found_by_its_targets() -> None:
+    """Of fiducials alone an affine transformation takes a mirror up."""
+    solver, given = _Solver(Options()), faults.blunder_network(11)
+    rest = nets.keep_rows(given, lambda image, *_: image != "f2")
+    found = solver.trials.adjust(replace(rest, images=tuple(each for each in given.images if each.name != "f2")))
+    assert found is not None
+    words = "the fiducials of image f2 have each other's names: 1 is 2, 2 is 1, 3 is 4, 4 is 3. Correct the names."
+    assert frame_cause(_in_a_mirror(given, "f2"), "f2", found, solver.trials) == words
+
+
+def test_errors_of_all_fiducials_of_a_frame_are_not_those_of_single_marks() -> None:
+    """The film without fiducials ended in an internal error."""
+    given = faults.blunder_network(11)
+    rows = [nets.observation_row(given, "fiducial", "f2", id_) for id_ in "12345"]
+    errors = np.array([(1, -1), (-1, -1), (1, 1), (-1, 1), (1, 2)]) * 0.1
+    result = _Solver(Options()).trials.adjust(nets.add_errors(given, dict(zip(rows, errors, strict=True))))
+    assert result is not None
+    assert result.converged
+    assert not _is_of_single_marks(result, lambda _: pytest.fail("adjusted"), lambda _: True)
+
+
+def test_tangential_terms_of_juhl_that_are_held_are_freed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The pictures had been called bowed."""
+
+    def tangential(truth: nets.Truth, x: Array, y: Array) -> tuple[Array, Array]:
+        radius = np.hypot(x, y) / 100.0
+        size = -0.02 * radius**1.85 * (x + 0.5 * y) / np.hypot(x, y)
+        return size * y / np.hypot(x, y), -size * x / np.hypot(x, y)
+
+    monkeypatch.setattr(nets, "torlegard", tangential)
+    given = nets.set_camera(
+        faults.blunder_network(1), distortion=Distortion("juhl", {"r1": Prior(0.0, np.inf)}, r0_mm=100.0)
+    )
+    (found,) = adjust(given).explanations
+    assert found.kind == "decentering"
+    assert found.remedy == 'Free t1, t2, t3, t4 under [distortion.sigma] of the camera ("free").'
