@@ -100,7 +100,12 @@ class PictureForm:
     bits: int
 
     def check(self, path: Path, stored_bytes: int, max_pixels: int | None) -> None:
-        """Check the size of a picture that is decoded whole, see `check_size`."""
+        """Check the size of a picture that is decoded whole, see `check_size`, and that it has grey values."""
+        if self.bits == 1:
+            raise MeasurementError(
+                f"{path} has black and white pixels only (1 bit), and marks are measured by the grey values along "
+                "their edges: save the scan as grey or RGB with 8 or 16 bits a sample"
+            )
         decoded_bytes = self.width_px * self.height_px * self.channels * -(-self.bits // 8)
         check_size(path, "a picture", (self.width_px, self.height_px), decoded_bytes, stored_bytes, max_pixels)
 

@@ -37,17 +37,12 @@ _HEADER_BOXES = (b"jp2h", b"res ")  # that contain other boxes
 
 
 def open_png(path: Path, max_pixels: int | None) -> OpenedPicture:
-    """Open and decode a PNG file. Raises MeasurementError for a truncated or damaged file, and for a size that exceeds
-    the limits of `check_size`."""
+    """Open and decode a PNG file. Raises MeasurementError for a truncated or damaged file, and as
+    `PictureForm.check`."""
     data = path.read_bytes()
     form = png_form(data)
     if form is None:
         raise damage_error(path, "its header is cut short")
-    if form.bits == 1:
-        raise MeasurementError(
-            f"{path} is a PNG of black and white pixels only (1 bit), and marks are measured by the grey values along "
-            "their edges: save the scan as grey or RGB with 8 or 16 bits a sample"
-        )
     form.check(path, len(data), max_pixels)
     try:
         samples = grey_or_colour(imagecodecs.png_decode(data))

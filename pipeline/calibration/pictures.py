@@ -33,6 +33,7 @@ from pipeline.text.files import SCAN_ENDINGS, names_below
 _Kind = tuple[int, int, float | None]  # width, height, focal length
 QUARTERS_DEG = (90, 270)
 TURNS_BY_TAG = {6: 90, 8: 270}  # Exif's Orientation of images that viewers turn back
+UNREAD_ENDINGS = (".heic", ".heif", ".avif", ".webp", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf")
 MOST_GROUPS, FEWEST_IN_GROUP = 8, 4  # of images by their names; images for a calibration with standard deviations
 PLAIN = 20.0  # twice the log-likelihood ratio; odds of e to the 10
 FEWEST_PICTURES = 3  # of a flat board with known turns, needed for principal distance and principal point
@@ -95,6 +96,9 @@ def find_pictures(given: Sequence[Path], out: Path) -> BoardPictureFiles:
         raise InputError(f"{where}: there is no picture ({', '.join(SCAN_ENDINGS)}). Name the folder that has them.")
     heads, errors = dict[Path, ScanHead](), dict[Path, str]()
     for path in paths:
+        if path.suffix.lower() in UNREAD_ENDINGS:
+            errors[path] = f"{path} is of a kind that is not read: convert it to JPEG, PNG or TIFF, as large as it is"
+            continue
         try:
             heads[path] = read_head(path)
         except MeasurementError as error:
@@ -143,9 +147,11 @@ def _files(given: Iterable[Path], out: Path) -> Iterator[Path]:
             folder = path / below
             if folder.resolve() == out or out in folder.resolve().parents:
                 continue
-            for name in sorted(os.listdir(folder)):
-                if not name.startswith(".") and Path(name).suffix.lower() in SCAN_ENDINGS:
-                    yield folder / name
+            found = [folder / name for name in sorted(os.listdir(folder)) if not name.startswith(".")]
+            read = [file for file in found if file.suffix.lower() in SCAN_ENDINGS]
+            yield from read
+            stems = {file.stem for file in read}  # a raw picture beside its JPEG is none that is missing
+            yield from (file for file in found if file.suffix.lower() in UNREAD_ENDINGS and file.stem not in stems)
 
 
 def _names(cameras: Sequence[_Kind]) -> list[str]:

@@ -481,6 +481,19 @@ def test_pictures_of_two_cameras_are_told_apart_by_their_names(apart_px: float, 
     assert not said or re.search(r"\*leftp\*: .* cx 20[23]\.\d.*\*rightp\*: .* cx 19[01]\.\d", said)
 
 
+def test_pictures_of_kinds_that_are_not_read_are_named(tmp_path: Path) -> None:
+    """HEIC of a telephone had been passed over without a word; black and white ones had been cameras of their own."""
+    for name in ("a.HEIC", "b.webp", "p0.NEF"):
+        (tmp_path / name).write_bytes(b"no picture")
+    Image.fromarray(picture(0)).save(tmp_path / "p0.png")
+    Image.fromarray(picture(0)).convert("1").save(tmp_path / "q.png")
+    found = find_pictures([tmp_path], tmp_path / "o")
+    assert (*found.files,) == ("p0",)
+    assert sorted(found.unreadable) == ["a.HEIC", "b.webp", "q"]
+    assert "convert it to JPEG, PNG or TIFF" in found.unreadable["b.webp"]
+    assert "black and white pixels only" in found.unreadable["q"]
+
+
 def test_parts_of_names_that_make_groups() -> None:
     """Folders, sides and numbers of cameras; numbers of pictures and single ones make none."""
     pairs = [f"{side}{number:02}" for number in range(5) for side in ("left", "right")]
