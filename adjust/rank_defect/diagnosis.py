@@ -9,7 +9,7 @@ valley it leads to the smallest parameters (Tikhonov regularisation). If the obs
 used (Morozov's discrepancy principle), and none where they separate the parameters.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 
@@ -240,18 +240,19 @@ def undetermined(problem: Problem, state: State, variances: Array) -> str:
     return f"{statement}, for {field.because}. To determine them, {field.remedy}."
 
 
-def loose_principal_distances(problem: Problem, state: State, variances: Array) -> Iterator[str]:
-    """Sentences on principal distances without a prior that the observations hardly determine."""
-    unknowns = problem.unknowns
+def loose_principal_distances(problem: Problem, state: State, variances: Array) -> dict[str, str]:
+    """Sentences on principal distances without a prior that the observations hardly determine, by camera."""
+    unknowns, found = problem.unknowns, dict[str, str]()
     for name, positions in unknowns.camera.items():
         at = positions[0]
         share = float(np.sqrt(variances[at]) / state.values[at])
         if np.isinf(unknowns.sigma[at]) and share > LOOSE:
             field = directions.field_geometry(problem, state, name)
-            yield (
+            found[name] = (
                 f"The principal distance of camera {name} is determined to {100.0 * share:.0f} % only, for "
                 f"{field.because}. To determine it better, {field.remedy}; or give it with its standard deviation."
             )
+    return found
 
 
 def _collapse(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:

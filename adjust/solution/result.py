@@ -45,7 +45,7 @@ from adjust.quality.significance import (
 )
 from adjust.quality.variance_components import factor_sigmas, variance_factor
 from adjust.rank_defect import datum
-from adjust.rank_defect.diagnosis import held_directions, inseparable
+from adjust.rank_defect.diagnosis import held_directions, inseparable, loose_principal_distances
 from adjust.solution.explanations import Explanation, explain
 from adjust.solution.options import Options
 from adjust.solution.point_hypotheses import diameter_notes
@@ -295,6 +295,14 @@ class Adjustment(estimates.Estimates, PlottedResult):
         notes = (held_decentering_notes, film_scale_notes) if self.converged else ()
         of_interior = (note for each in notes for note in each(self.run, self.cofactor))
         return (*self.unused, *(sentence for _, sentence in self._inseparable.values()), *of_disks, *of_interior)
+
+    @cached_property
+    def loose_cameras(self) -> frozenset[str]:
+        """Names of the cameras whose principal distance the images hardly determine, as a warning says."""
+        run = self.scaled
+        if not run.converged:
+            return frozenset()
+        return frozenset(loose_principal_distances(run.numbering.problem, run.end.state, self.cofactor.variances))
 
     def inseparable(self, camera: str) -> list[str]:
         """Distortion parameters of a camera that the observations do not separate."""

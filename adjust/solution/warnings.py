@@ -101,7 +101,7 @@ def _weak_parameters(run: Run, cofactor: Cofactor) -> Iterator[str]:
         yield f"Practically singular without priors ({description(each.parameters)}): {each.cause} {each.remedy}"
     if run.converged:
         yield from filter(None, [undetermined(problem, state, cofactor.variances)])
-        yield from loose_principal_distances(problem, state, cofactor.variances)
+        yield from loose_principal_distances(problem, state, cofactor.variances).values()
         yield from weak_term_sentences(run.numbering, state, run.factor, cofactor)
 
 

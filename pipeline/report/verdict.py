@@ -265,8 +265,7 @@ def _lens_problems(data: ReportData, solved: AdjustmentRecord) -> Iterator[Repor
     for name, camera in solved.cameras.items():
         c = camera.principal_distance_mm
         sigma = max(c.sigma, c.sigma_clusters or 0.0)
-        has_warning = any(each.startswith(f"The principal distance of camera {name} is") for each in solved.warnings)
-        if not (c.given and math.isfinite(c.given.sigma)) and sigma > LOOSE * c.value and not has_warning:
+        if not (c.given and math.isfinite(c.given.sigma)) and sigma > LOOSE * c.value and not camera.is_loose:
             yield ReportedProblem(
                 f"The principal distance of {name} is known to {100.0 * sigma / c.value:.0f} % only: the images "
                 "hardly separate it from how far away they were taken.",

@@ -195,6 +195,7 @@ def _camera(adjustment: Adjustment, camera: Camera, frame_mm: tuple[float, float
         },
         lens_known=None if reach is None else record_from(records.LensReachRecord, reach),
         projection=() if reach is None else tuple(_projection(adjustment, camera.name)),
+        is_loose=camera.name in adjustment.loose_cameras,
     )
 
 

@@ -181,7 +181,8 @@ class CameraRecord:
     """Interior orientation, distortion and fiducial marks by name.
 
     significance: F-tests of groups of parameters; lens_known: None without observations or a solution; projection:
-    empty if it was not computed; converted: source of a converted lens.
+    empty if it was not computed; converted: source of a converted lens; is_loose: whether a warning says that the
+    images hardly determine the principal distance.
     """
 
     principal_distance_mm: Quantity
@@ -192,6 +193,7 @@ class CameraRecord:
     lens_known: LensReachRecord | None = None
     projection: tuple[ProjectionRecord, ...] = ()
     converted: ConvertedFrom | None = None
+    is_loose: bool = False
 
     @property
     def is_calibrated(self) -> bool:

@@ -85,7 +85,9 @@ class MadeUpAdjustment(Adjustment):
 
     def __post_init__(self) -> None:
         nothing = dict.fromkeys(("further", "contradictions", "suspects", "explanations", "warnings", "notes"), ())
-        self.__dict__.update({**nothing, "reliability": None, "variance_sigmas": {}, **self.known})
+        self.__dict__.update(
+            {**nothing, "reliability": None, "variance_sigmas": {}, "loose_cameras": set(), **self.known}
+        )
 
 
 @cache
