@@ -135,6 +135,8 @@ class LocalPool(futures.ThreadPoolExecutor):
             process = getattr(self._own, "process", None) or self._start()
             with suppress(BrokenProcessPool):
                 process.submit(os.getpid).result()
+                # With the last open end in the process itself, its death in the middle of a result ends the reading.
+                process._result_queue._writer.close()  # type: ignore[union-attr]
                 return process
             self._own.process = None
         raise WorkerKilled

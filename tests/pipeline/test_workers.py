@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -111,6 +112,24 @@ def test_a_task_that_kills_its_process_twice_is_given_up_and_none_else(tmp_path:
             bad.result(60)
         assert [other.result(60) for other in others] == list(range(6))
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def half_sent() -> bytes:
+    """Ends its process in the middle of the result."""
+
+    def send_half(sender: Connection, content: bytes) -> None:
+        os.write(sender.fileno(), content[: len(content) // 2])
+        os._exit(1)
+
+    Connection._send = send_half  # type: ignore[attr-defined]
+    return bytes(1000)
+
+
+def test_a_process_that_ends_in_the_middle_of_its_result_is_not_waited_for() -> None:
+    with worker_pool(1, workers=1) as pool:
+        with pytest.raises(WorkerKilled):
+            pool.submit(half_sent).result(30)
+        assert pool.submit(abs, -1).result(60) == 1
 
 
 def test_a_process_killed_on_its_way_says_nothing_of_the_task(tmp_path: Path) -> None:
