@@ -5,10 +5,11 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from pipeline.archive.checked_results import find_check_run, latest
 from pipeline.archive.results_database import ResultsDatabase
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
-from pipeline.provenance import FileIdentity, FileStates, fingerprint, hash_text, parts_hash
+from pipeline.provenance import FileIdentity, FileStates, file_state, fingerprint, hash_text, parts_hash
 from pipeline.results.adjustment_file import covariance_path, read_adjustment, read_own_covariance
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparator_file import ComparatorPoint
@@ -64,6 +65,29 @@ def measured_from(project: Project) -> MadeFrom:
             for image, path in project.scans.items()
         },
     }
+
+
+def changed_scans(project: Project, digest: str = "") -> list[str]:
+    """Images measured from another file than there is now, or no longer of the project. A file that is missing may be
+    the measured one.
+
+    digest: of the check run; "" for the latest. Raises InputError where review decisions are not in the marks.
+    """
+    path = project.measurement_path
+    if not project.scans or not path.exists():
+        return []
+    with ResultsDatabase(path) as database:
+        check_run = find_check_run(database, digest) if digest else latest(database)
+    if check_run is None:
+        return []
+    made, now = check_run.made_from, measured_from(project)
+    if made.get(DECISIONS) != now.get(DECISIONS):
+        raise InputError(
+            f"{path}: is of other decisions than there are now. Run `reseau measure`, which takes them in."
+        )
+    images = [name.removeprefix(SCAN) for name in differing(made, now) if name.startswith(SCAN) and name in made]
+    folder = project.path.resolve().parent
+    return [name for name in images if name not in project.scans or file_state(project.scans[name], folder).bytes >= 0]
 
 
 def current_adjustment(project: Project, marks: Sequence[ComparatorPoint]) -> AdjustmentRecord | None:

@@ -15,7 +15,7 @@ from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.scanner import NO_BEND
 from measure.scans.remote import ScanPart
 from pipeline.adjusting.picture_turn import NOT_TURNED, Turn, picture_turn, turned_back
-from pipeline.archive.made_from import current_adjustment
+from pipeline.archive.made_from import changed_scans, current_adjustment
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
@@ -28,9 +28,11 @@ from pipeline.results.comparator_file import (
     has_pixels_alone,
     pixel_from_comparator,
     read_comparator,
+    read_measurement_hash,
     read_pitches,
 )
 from pipeline.results.image_unit import FILM_UNIT, ImageUnit
+from pipeline.text.wording import listed
 from pipeline.types import Array
 
 if TYPE_CHECKING:
@@ -234,11 +236,16 @@ def read_block(project: Project) -> ImageBlock:
 
     Raises
     ------
-    InputError : nothing was measured, or the adjustment is stale.
+    InputError : nothing was measured, or the marks or the adjustment are stale.
     """
     if not project.comparator.exists():
         raise InputError(f"{project.comparator}: there is no such file. Run `reseau measure` first.")
     marks = read_comparator(project.comparator, project.list_pitch_um)
+    digest = read_measurement_hash(project.comparator)
+    if digest and (changed := changed_scans(project, digest)):
+        raise InputError(
+            f"{project.comparator}: is of other scans than there are now: {listed(changed)}. Run `reseau measure`."
+        )
     adjustment = current_adjustment(project, marks)
     pitches = read_pitches(project.comparator)
     if project.list_pitch_um is not None and has_pixels_alone(project.comparator):

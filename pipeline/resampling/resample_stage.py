@@ -30,7 +30,7 @@ from measure.scans.remote import scan_path
 from measure.scans.scan import Scan
 from pipeline.adjusting.picture_turn import picture_turn
 from pipeline.archive.checked_results import read_measurement
-from pipeline.archive.made_from import current_adjustment
+from pipeline.archive.made_from import changed_scans, current_adjustment
 from pipeline.archive.verdicts import Verdict, has_problem, scan_doubt, scan_verdict
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
@@ -350,7 +350,7 @@ def resample_tasks(
     project: Project, folder: Path, pitch_um: float | None, with_lens: bool, degree: Degree
 ) -> tuple[list[ResampleTask], list[Resampled]]:
     """Tasks of a project, and the failures of scans that cannot be resampled."""
-    scans = read_measurement(project.measurement_path)
+    scans, changed = read_measurement(project.measurement_path), changed_scans(project)
     adjustment = None
     if project.comparator.exists():
         adjustment = current_adjustment(project, read_comparator(project.comparator, project.list_pitch_um))
@@ -362,6 +362,9 @@ def resample_tasks(
     taking_lens = None if project.lens is None else project.lens.lens
     for measured in scans:
         image = measured.frame.image
+        if image in changed:
+            failed.append(Resampled(image, None, problem="its file is not the one measured: run `reseau measure`"))
+            continue
         frame = project.image_frame(image)
         chain = _chain(measured, adjustment, with_lens, frame != image, taking_lens)
         if isinstance(chain, str):

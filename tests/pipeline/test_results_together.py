@@ -40,9 +40,10 @@ from measure.flags import Code, Reason
 from measure.results import Covariance, FrameMeasurement
 from pipeline import read_measurement, read_project, stages
 from pipeline.adjusting import second_pass
-from pipeline.archive.made_from import measured_from
+from pipeline.archive.made_from import changed_scans, measured_from
 from pipeline.provenance import fingerprint, parts_hash
 from pipeline.report.load import adjusted_data
+from pipeline.resampling.resample_stage import resample_tasks
 from pipeline.results.comparator_file import write_comparator
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.summary import summarise
@@ -205,6 +206,29 @@ def test_stale_results_are_listed_and_not_shown(project: Path, change: Spoil, wo
     assert code == 1
     assert words in join_problems(own_summary)
     assert {name for name in ("adjustment", "check") if own_summary[name] is not None} == kept
+
+
+def test_what_is_not_of_the_present_scans_and_decisions_is_not_handed_on(
+    project: Path, tmp_path: Path, refusal: Refusal
+) -> None:
+    """A rectified frame would show a new picture as the earlier one lay."""
+    file, first = project / "project.toml", project / "scans" / "frame1.tif"
+    shutil.copy(project / "scans" / "frame2.tif", first)
+    words = "is of other scans than there are now: frame1. Run `reseau measure`"
+    assert words in refusal("export", file, "csv", tmp_path / "csv")
+    tasks, failed = resample_tasks(read_project(file), tmp_path, None, False, 3)
+    assert ([task.image for task in tasks], [one.image for one in failed]) == (["frame2", "frame3"], ["frame1"])
+    assert "not the one measured: run `reseau measure`" in failed[0].problem
+    replace_text(file, "scans = [", 'exclude = ["scans/frame1.tif"]\nscans = [')
+    assert words in refusal("export", file, "csv", tmp_path / "csv")
+    replace_text(file, 'exclude = ["scans/frame1.tif"]\n', "")
+    first.unlink()
+    first.symlink_to(tmp_path / "offline.tif")  # the marks may be of it
+    assert changed_scans(read_project(file)) == []
+    line = {"image": "frame2", "point": "1", "kind": "fiducial", "decision": "reject", "who": "ann", "fingerprint": "0"}
+    (project / "decisions.jsonl").write_text(json.dumps({**line, "when": "2026-01-31T12:00:00+00:00"}) + "\n")
+    for arguments in (("export", file, "csv", tmp_path / "csv"), ("resample", file, tmp_path / "frames")):
+        assert "of other decisions than there are now" in refusal(*arguments)
 
 
 def test_a_check_writes_nothing_but_its_own_file(project: Path, refusal: Refusal) -> None:
