@@ -105,6 +105,15 @@ class NewProject:
             "drawing with a scan",
             [f"{_place(group)}: {group.camera}" for group in self.named if group.rests_on_form],
         )
+        yield (
+            "are in a group of which a sample does not show the camera; others may be among them: "
+            "`reseau cameras --scan FILE` names a scan's, images.csv sets it",
+            [
+                f"{_place(group)}: {group.camera}, not found in {listed([path.name for path in group.unlike])}"
+                for group in self.named
+                if group.unlike
+            ],
+        )
         yield ("are no scans of film, and are left out", [f"{_place(one)}: {one.why_not()}" for one in self.digital])
         numbers = defaultdict[str, set[str]](set)
         for group in self.named:

@@ -22,7 +22,7 @@ from measure.scans.remote import Address, list_addresses
 from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.library import library_names, library_path
-from pipeline.files.scan_files import folders_below
+from pipeline.files.scan_files import each_once, folders_below
 from pipeline.measuring.camera_identification import Identification
 from pipeline.measuring.camera_trials import identify
 from pipeline.progress import Count, Reporter
@@ -117,6 +117,11 @@ class ScanGroup:
             return ()
         others = dict.fromkeys(name for sample in self.samples for name in sample.much_alike())
         return tuple(others) if self.cameras else ()
+
+    @property
+    def unlike(self) -> list[Path]:
+        """Samples that do not show the identified camera: others may be among the group's scans."""
+        return [sample.scan for sample in self.samples if self.camera and self.camera not in sample.best_names()]
 
     @property
     def rests_on_form(self) -> bool:
@@ -259,10 +264,8 @@ def catalogue(given: Sequence[Path], count: Count, max_pixels: int | None = None
         members[path.parent if by_folder else Path(), own].append((path, head))
     copies = dict[Path, Path]()
     if by_folder:
-        # The original is no link, and has the shortest name: copies are called `Copy of 0001` or `0001 (1)`.
-        by_name = sorted(
-            (path for path in files if path not in unread), key=lambda path: (path.is_symlink(), len(path.name))
-        )
+        # The original has the shortest name: copies are called `Copy of 0001` or `0001 (1)`.
+        by_name = sorted((path for path in files if path not in unread), key=lambda path: len(path.name))
         for original, *others in alike_groups(by_name, lambda path: path.stat().st_size, parts_hash, content_hash):
             copies |= dict.fromkeys(others, original)
     groups = (
@@ -364,7 +367,8 @@ def find_scan_files(given: Sequence[Path]) -> tuple[list[Path], Counter[str]]:
     """Return the given files and all scans in and below the folders, sorted by name, and a count of other files by
     ending.
 
-    Hidden files are skipped. Raises InputError where there is no scan.
+    Hidden files are skipped. A file is returned once, however many links lead to it, as the project's patterns find it.
+    Raises InputError where there is no scan.
     """
     files, endings = set[Path](), Counter[str]()
     for path in given:
@@ -383,7 +387,9 @@ def find_scan_files(given: Sequence[Path]) -> tuple[list[Path], Counter[str]]:
         raise InputError(
             f"{where}: no scan there, nor below. Files that end in {', '.join(SCAN_ENDINGS)} are scans.{held}"
         )
-    return sorted(files), endings
+    named = set(given)
+    own = each_once({str(file): file in named for file in sorted(files) if not isinstance(file, Address)}, ())
+    return sorted(file for file in files if isinstance(file, Address) or str(file) in own), endings
 
 
 def _files_below(folder: Path) -> Iterator[Path]:

@@ -37,7 +37,10 @@ NEXT_STEP = {
     Verdict.GOOD: "Nothing.",
     Verdict.DECIDED: "Nothing.",
     Verdict.LOOK: "Read the reasons in the report; decide in `reseau review`, or leave it: its sigmas allow for it.",
-    Verdict.POOR: "Is the scan of this camera, complete and sharp? Scan it again, or name it in `exclude`.",
+    Verdict.POOR: (
+        "Is the scan of this camera (`reseau cameras --scan FILE`), complete and sharp? Scan it again, or name it in "
+        "`exclude`."
+    ),
     Verdict.FAILED: "Repair or replace the file; `--retry` after an outage; or name it in `exclude`.",
     Verdict.WAITING: "Run `reseau measure`.",
     Verdict.OLD: "Run `reseau measure`: it measures or checks only these again.",

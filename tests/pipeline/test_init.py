@@ -98,7 +98,7 @@ def test_files_are_sorted_into_kinds_copies_and_broken_ones(box: Path, tmp_path:
     first.with_name("b.tif").write_bytes(data)
     assert catalogue([first.parent], no_count).copies == {}
     (first.parent / "0.tif").symlink_to("b.tif")
-    assert catalogue([first.parent], no_count).copies == {first.with_name("0.tif"): first.with_name("b.tif")}
+    assert catalogue([first.parent], no_count).groups[0].paths == (first, first.with_name("b.tif"))
 
 
 def identify_camera(
@@ -151,6 +151,8 @@ def test_a_camera_is_known_by_most_samples_and_by_what_its_plate_does_not_contra
     assert not fake_group(group, replace(identify_camera(path, "arrow-153"), plate=plate)).rests_on_form
     both = fake_group(group, identify_camera(path, "wild-rc30-153", "wild-rc10-153"))
     assert both.camera == "wild-rc10-153"  # by far the more reports
+    assert fake_group(group, identify_camera(path), alike, alike).unlike == [path]
+    assert not fake_group(group, alike, alike).unlike
 
 
 @pytest.fixture
@@ -168,6 +170,7 @@ def fake_identification(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("fake_identification")
 def test_the_project_has_each_scans_camera(box: Path, tmp_path: Path, printed: Printed, refusal: Refusal) -> None:
     out = tmp_path / "work" / "first"
+    (box / "1952" / "3.tif").symlink_to("0003.tif")  # in `exclude` it would exclude the scan itself
     fake_identification = json.loads(printed("init", box, "--out", out, "--json", code=1))
     project = read_project(out / "project.toml")
     assert sorted(project.scans) == ["0001", "0002", "0003", "0004"]
