@@ -274,7 +274,7 @@ class Adjustment(estimates.Estimates, PlottedResult):
         own = (
             ()
             if self.coordinate_blunders and not self.converged
-            else run_warnings(self.scaled, self.cofactor, self.residuals)
+            else run_warnings(self.scaled, self.cofactor, self.residuals, self._explanation_run[1])
         )
         curved = curved_valley_warnings(self.run, self.cofactor) if self.converged else ()
         return (

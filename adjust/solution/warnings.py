@@ -48,14 +48,17 @@ CURVED = 0.5  # share of the rise of v'Pv that these promise below which they ar
 STEPS = 60  # iterations along a curved valley, which converge slowly
 
 
-def run_warnings(run: Run, cofactor: Cofactor, residuals: Residuals) -> list[str]:
-    """Collect warnings on an adjustment: termination, weak parameters, swapped numbers, unchecked images."""
+def run_warnings(run: Run, cofactor: Cofactor, residuals: Residuals, explained: Run) -> list[str]:
+    """Collect warnings on an adjustment: termination, weak parameters, swapped numbers, unchecked images.
+
+    explained: that with the explanations of its residuals.
+    """
     return [
         *_termination(run),
         *_weak_parameters(run, cofactor),
         *_input(run.problem),
         *_swapped_numbers(run, residuals),
-        *_repeated_images(run),
+        *_repeated_images(explained),
         *_repeated_marks(run.problem.network.observations),
         *(_unchecked_orientations(run.problem, residuals) if run.converged else ()),
     ]
@@ -173,15 +176,18 @@ def _unchecked_orientations(problem: Problem, residuals: Residuals) -> Iterator[
 def _repeated_images(run: Run) -> Iterator[str]:
     """Warn of images whose marks lie nearer to each other than independent errors allow: one picture under two names.
 
-    Differences of their coordinates are compared with the variances of both, in the scale of the residuals. Fiducial
-    marks alone may lie alike in all frames: they have to be equal.
+    Differences of their coordinates are compared with the variances of both, in the scale of the median residual.
+    Fiducial marks alone may lie alike in all frames: they have to be equal.
     """
     problem, observations = run.problem, run.problem.network.observations
     point = np.array(observations.point)
     images = [(name, rows[np.argsort(point[rows], kind="stable")]) for name, rows in _rows_by_image(problem)]
-    marks = run.weighting.used & (np.arange(len(run.units)) < len(observations))
-    vpv, redundancy = run.group_sums(marks) if run.converged else (1.0, 1.0)
-    covariance = observations.covariance_mm2 * (vpv / redundancy if redundancy >= 1.0 else 1.0)
+    # The median of the squares of a bivariate normal distribution is 2 ln 2; gross errors hardly raise it.
+    marks = np.flatnonzero(run.weighting.used[: len(observations)]) if run.converged else np.empty(0, dtype=np.intp)
+    squares = (run.misfits.residual[marks] ** 2).sum(axis=1)
+    share = run.redundancies[marks].mean() if len(marks) else 0.0
+    variance = float(np.median(squares)) / (2.0 * np.log(2.0) * share) if share > UNCHECKED else 1.0
+    covariance = observations.covariance_mm2 * variance
     middles = np.array([observations.xy_mm[rows].mean(axis=0) for _, rows in images])
     reach = 2.0 * float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).max(initial=0.0)))
     pairs = []

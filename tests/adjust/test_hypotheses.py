@@ -1046,3 +1046,15 @@ def test_tangential_terms_of_juhl_that_are_held_are_freed(monkeypatch: pytest.Mo
     (found,) = adjust(given).explanations
     assert found.kind == "decentering"
     assert found.remedy == 'Free t1, t2, t3, t4 under [distortion.sigma] of the camera ("free").'
+
+
+def test_neighbouring_views_are_no_copies_where_a_wrong_point_makes_residuals_large() -> None:
+    """One of two views 0.6 mm apart had been called the other's copy."""
+    made = faults.scene(2, flat=True)
+    stations, rotations = made.stations.copy(), made.rotations.copy()
+    stations[1], rotations[1] = stations[0] + [0.5, 0.3, 0.0], rotations[0]
+    made = replace(made, stations=stations, rotations=rotations)
+    result = adjust(faults.misfit_network(made, faults.Effects(point=20.0), SOUND, np.random.default_rng(2)))
+    assert result.sigma0 > 100.0
+    assert [each.kind for each in result.explanations] == ["point"]
+    assert result.warnings == ()
