@@ -263,7 +263,7 @@ def _find_in_stages(
     while pending:
         stage = pending.pop(0)
         if stage.kind == "turned":
-            found = _in_other_orientations(scan, layout, options, found, at_given)
+            found = _in_other_orientations(scan, layout, options, found)
             continue
         if stage.is_unnecessary(found):
             continue
@@ -309,15 +309,15 @@ def _find_in_stages(
 
 
 def _in_other_orientations(
-    scan: Scan, layout: FiducialLayout, options: FiducialOptions, found: StageResult, at_given: SearchResult
+    scan: Scan, layout: FiducialLayout, options: FiducialOptions, found: StageResult
 ) -> StageResult:
-    """Measure a frame that is not sure in the other orientations that score as well at its place."""
+    """Measure a frame that is not sure, but has a clear mark, in other orientations that score as well at its place."""
     frame = found.frame
-    if frame is None or frame.is_sure or not at_given.placements:
+    if frame is None or frame.is_sure or not frame.clear_fits:
         return found
-    best = frame.placement if found.is_taken else at_given.placements[0]
+    best = frame.placement if found.is_taken else found.result.placements[0]
     start = frame.scan if found.is_taken else scan
-    turned = (measure_frame(start, layout, each, options) for each in _orientations_at(at_given, best, frame))
+    turned = (measure_frame(start, layout, each, options) for each in _orientations_at(found.result, best, frame))
     most = max((frame, *turned), key=_match)
     return replace(found, frame=most, is_taken=True) if most.accepted and most is not frame else found
 

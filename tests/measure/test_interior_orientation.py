@@ -454,12 +454,13 @@ def test_a_frame_is_measured_in_the_orientations_that_score_as_well(
     places = ((7.0 + uneven_mm, -7.0), *CORNERS[1:])
     layout = lay_out([DOT] * 4, places, (16.0, 16.0))
     scan, placements = make_scan(picture(layout, "180")), (placement("0"), placement("180"))
-    found = stages.StageResult(frame=measure_frame(scan, layout, placements[0], OPTIONS))
     search = cast(Any, {placements[0].pitch_mm: SimpleNamespace(same_mm=0.04)})
+    result = SearchResult(placements, search)
+    found = StageResult(result, measure_frame(scan, layout, placements[0], OPTIONS))
     if not uneven_mm:
         monkeypatch.setattr(Frame, "is_sure", False)
         monkeypatch.setattr(stages, "measure_frame", lambda *_: pytest.fail("it is measured again"))
-    taken = stages._in_other_orientations(scan, layout, OPTIONS, found, SearchResult(placements, search))
+    taken = stages._in_other_orientations(scan, layout, OPTIONS, found)
     assert taken.is_taken == bool(uneven_mm)
     assert taken.frame is not None
     places_px = {index: fit.center_px for index, fit in taken.frame.inlier_fits.items()}
