@@ -43,6 +43,8 @@ class BoardOptions:
     spacing_mm : side of a square, or distance from one marker or circle to the next; of an asymmetric grid the distance
         of its rows, which is half the distance between two circles of a row.
     size_mm : of a marker or a circle.
+    row_spacing_mm : distance of the rows of circles, where it is another than spacing_mm, which is then that of the
+        columns: half the distance in a row of an asymmetric grid.
     """
 
     kind: BoardKind
@@ -53,6 +55,7 @@ class BoardOptions:
     dictionary: str | None = None
     legacy: bool = False
     first_id: int = 0
+    row_spacing_mm: float | None = None
 
     def __post_init__(self) -> None:
         """Raise InputError where an option of its kind is missing, before anything is read."""
@@ -80,6 +83,7 @@ class BoardOptions:
                 keys |= {"first_id": self.first_id}
             case "circle-grid" | "asymmetric-circle-grid":
                 keys |= {"spacing_mm": self.spacing_mm, "diameter_mm": self._size}
+                keys |= {"row_spacing_mm": self.row_spacing_mm} if self.row_spacing_mm else {}
                 if self.columns % 1:
                     keys |= {"kind": "circle-grid", "columns": round(2 * self.columns), "asymmetric": True}
         return "\n".join(["[targets]", *table_lines(keys), ""])
@@ -108,7 +112,10 @@ class BoardOptions:
         if self.size_mm is None:
             what = "the diameter of a circle" if "circle" in self.kind else "the side of a marker"
             raise InputError(f"--marker is missing: {what}, such as --marker 18mm, is needed for {self.kind}.")
-        nearest_mm = self.spacing_mm * (math.sqrt(2.0) if self.kind == "asymmetric-circle-grid" else 1.0)
+        across_mm, down_mm = self.spacing_mm, self.row_spacing_mm or self.spacing_mm
+        nearest_mm = min(across_mm, down_mm)
+        if self.kind == "asymmetric-circle-grid":
+            nearest_mm = min(2.0 * nearest_mm, math.hypot(across_mm, down_mm))
         if not self.size_mm < nearest_mm:
             raise InputError(
                 f"--marker {self.size_mm:g} mm is not smaller than the distance from one to the next, {nearest_mm:.4g} "
@@ -151,8 +158,12 @@ def board_options(
         raise InputError(f"--board {board}: must be two counts of 1 to {MOST}, COLUMNSxROWS, such as 9x6.")
     size_mm = None if marker is None else _length_mm("--marker", marker)
     columns, rows = (float(each) if "." in each else int(each) for each in counts.groups())
-    spacing_mm = _length_mm("--square", square)
-    found = BoardOptions(kinds[kind], columns, int(rows), spacing_mm, size_mm, dictionary, legacy, first_id)
+    both = re.fullmatch(r"([\d.]+) ?[x×*] ?([\d.]+ ?(mm|cm|m|in))", square.strip()) if "circle" in kind else None
+    spacing_mm = _length_mm("--square", f"{both[1]}{both[3]}" if both else square)
+    row_spacing_mm = _length_mm("--square", both[2]) if both else None
+    found = BoardOptions(
+        kinds[kind], columns, int(rows), spacing_mm, size_mm, dictionary, legacy, first_id, row_spacing_mm
+    )
     try:
         _ = found.spec
     except ValueError as error:

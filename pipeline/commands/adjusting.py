@@ -133,7 +133,13 @@ def calibrate(
         list[Path], typer.Argument(metavar="FOLDER_OR_FILES...", help="Pictures of the board.", show_default=False)
     ],
     board: Annotated[str, typer.Option(metavar="9x6", help="Inner corners, squares (charuco), markers or circles.")],
-    square: Annotated[str, typer.Option(metavar="25mm", help="Side of a square, or distance from one to the next.")],
+    square: Annotated[
+        str,
+        typer.Option(
+            metavar="25mm",
+            help="Side of a square, or distance from one to the next; 10x17.3mm: of columns and of rows of circles.",
+        ),
+    ],
     kind: Annotated[
         str, typer.Option(help="chessboard, charuco, aprilgrid, aruco, circle-grid or asymmetric-circle-grid.")
     ] = "chessboard",

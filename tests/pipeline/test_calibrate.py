@@ -460,9 +460,12 @@ def test_what_is_wrong_with_pictures_is_given_in_pixels(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("apart_px", [0.0, 12.0])
-def test_pictures_of_two_cameras_are_told_apart_by_their_names(apart_px: float, tmp_path: Path) -> None:
+def test_pictures_of_two_cameras_are_told_apart_by_their_names(
+    apart_px: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """They had been called distorted each in its own way. The second camera's principal point lies 12 px to the left;
     names that differ where cameras do not are nothing to speak of."""
+    monkeypatch.setattr("pipeline.calibration.pictures.FEWEST_IN_GROUP", 5)
     _, marks = simulated_marks(tmp_path)
     shift_mm = np.array([apart_px * CHESSBOARD_PIXEL_MM, 0.0])
     both = [replace(mark, image=f"left{mark.image}") for mark in marks]
@@ -496,9 +499,9 @@ def test_pictures_of_kinds_that_are_not_read_are_named(tmp_path: Path) -> None:
 
 def test_parts_of_names_that_make_groups() -> None:
     """Folders, sides and numbers of cameras; numbers of pictures and single ones make none."""
-    pairs = [f"{side}{number:02}" for number in range(5) for side in ("left", "right")]
+    pairs = [f"{side}{number:02}" for number in range(8) for side in ("left", "right")]
     assert [list(each) for each in name_parts(pairs)] == [["left", "right"]]
-    folders = [f"cam{camera}/shot{number}_{camera}" for camera in (0, 1) for number in range(4)]
+    folders = [f"cam{camera}/shot{number}_{camera}" for camera in (0, 1) for number in range(9)]
     assert [list(each) for each in name_parts(folders)] == [["0", "1"]]
     assert not list(name_parts([*(f"p{number}" for number in range(20)), "q1"]))
     assert not list(name_parts([]))
@@ -603,6 +606,8 @@ def test_boards_as_project_files_have_them() -> None:
     rows = board("asymmetric-circle-grid", "2.5x3", "1in", "10mm")
     assert [name for name in rows.object_points() if name.startswith("r1")] == ["r1c1", "r1c3"]
     assert len(rows.object_points()) == 3 + 2 + 3
+    hexagonal = board("asymmetric-circle-grid", "2.5x3", "10 x 17.3mm", "9mm").object_points()
+    assert [hexagonal[name][:2] for name in ("r2c0", "r2c2", "r1c1")] == [(0.0, 0.0), (20.0, 0.0), (10.0, 17.3)]
     aruco = board("aruco", "3x2", "40mm", "30mm", "4X4_50", first_id=6)
     assert (aruco.marker_mm, aruco.gap_mm, aruco.first_marker) == (30.0, 10.0, 6)
     april = board("aprilgrid", "6x6", "114.4mm", first_id=3)
