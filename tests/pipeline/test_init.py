@@ -706,6 +706,22 @@ def test_a_drawn_camera_is_found_among_all(name: str, tmp_path: Path) -> None:
     assert name in [each for trial in found.best for each in trial.cameras], found.sentence()
 
 
+def test_the_wild_camera_with_eight_ringed_marks_has_corners_and_sides_of_others() -> None:
+    """Ringed corners of one sibling, ringed sides of another; both have siblings with plain crosses there."""
+    place, drawn = np.column_stack([np.diag([20.0, -20.0]), [50.0, 50.0]]), dict[tuple[str, str], Array]()
+    names = [f"wild-{name}-153" for name in ("rc10-ringed", "rc10", "rc10-eight", "rc8-eight")]
+    xy_mm = dict[tuple[str, str], Array]()
+    for name in names:
+        for mark in LIBRARY[name].layout().marks:
+            drawn[name, mark.id] = known_picture(mark.mark, place, 101, 101, 1.0)
+            xy_mm[name, mark.id] = np.array(mark.xy_mm)
+    for id in "12345678":
+        ringed, plain = (names[1], names[2]) if id in "1234" else (names[2], names[3])
+        like = [np.corrcoef(drawn[names[0], id].ravel(), drawn[name, id].ravel())[0, 1] for name in (ringed, plain)]
+        assert like[0] > 0.9 > 0.8 > like[1], (id, like)
+        assert np.abs(xy_mm[names[0], id] - xy_mm[names[2], id]).max() < 0.01
+
+
 @needs("film_scans", "aerial")
 def test_notches_that_much_of_the_reduced_scan_resembles_are_no_false_alarm() -> None:
     """At full resolution few of these places answer as strongly."""
