@@ -82,7 +82,7 @@ def judge(data: ReportData) -> ReportVerdict:
     shots = frames(data)
     problems = tuple(problem for found in problems_by_test(data, shots).values() for problem in found)
     is_fatal = data.adjustment is not None and any(_no_solution(data.adjustment))
-    level: Level = "failed" if is_fatal or not _observed_count(data, shots) else "look" if problems else "good"
+    level: Level = "failed" if is_fatal or not _observed_counts(data, shots) else "look" if problems else "good"
     return ReportVerdict(level, _sentence(data, shots, level, len(problems)), problems, tuple(_notes(data, shots)))
 
 
@@ -330,7 +330,7 @@ def _stage_notes(data: ReportData, shots: list[ReportedFrame]) -> Iterator[str]:
     if not data.comparator and not data.measurement and not data.totals:
         yield "No measurement was handed to this report."
     if not data.adjustment:
-        if data.stored_adjustment == "none" and _observed_count(data, shots):
+        if data.stored_adjustment == "none" and _observed_counts(data, shots):
             yield "These marks are not adjusted yet: run `reseau run`."
     elif not data.adjustment.converged:
         yield "There is no solution: all values and residuals of this report are those of the last iteration."
@@ -408,8 +408,9 @@ def _weight_notes(adjustment: AdjustmentRecord) -> Iterator[str]:
 
 
 def _sentence(data: ReportData, shots: list[ReportedFrame], level: Level, problems: int) -> str:
-    marks, images = _observed_count(data, shots), data.totals.marks if data.totals else [shot.image for shot in shots]
-    found = f"{counted(marks, 'mark')} in {counted(data.frame_count(images), 'frame')}"
+    observed = _observed_counts(data, shots)
+    marks = sum(observed.values())
+    found = f"{counted(marks, 'mark')} in {counted(data.frame_count(observed), 'frame')}"
     ending = f", but {counted(problems, 'thing needs', 'things need')} a look." if level == "look" else "."
     if not marks:
         return "No mark was measured."
@@ -433,9 +434,12 @@ def _sentence(data: ReportData, shots: list[ReportedFrame], level: Level, proble
     return f"Calibrated from {found}: {'; '.join(constants)}{ending}"
 
 
-def _observed_count(data: ReportData, shots: list[ReportedFrame]) -> int:
-    """Number of observed marks; from the adjustment if there is no comparator file."""
+def _observed_counts(data: ReportData, shots: list[ReportedFrame]) -> Mapping[str, int]:
+    """Numbers of observed marks by image, of images with any; from the adjustment if there is no comparator file."""
     if data.totals:
-        return sum(count[status] for count in data.totals.marks.values() for status in (Status.MEASURED, Status.WEAK))
-    marks = sum(mark.status.is_observation for frame in shots for mark in frame.marks)
-    return marks or (len(data.adjustment.residuals) if data.adjustment else 0)
+        counts = {image: count[Status.MEASURED] + count[Status.WEAK] for image, count in data.totals.marks.items()}
+    else:
+        counts = {shot.image: sum(mark.status.is_observation for mark in shot.marks) for shot in shots}
+    if not any(counts.values()) and data.adjustment:
+        counts = Counter(row.image for row in data.adjustment.residuals)
+    return {image: count for image, count in counts.items() if count}

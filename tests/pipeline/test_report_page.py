@@ -612,10 +612,11 @@ def test_fiducials_that_another_scan_of_the_frame_shows_are_not_missing(frame: s
 
 
 @pytest.mark.parametrize("is_many", [False, True])
-def test_the_parts_of_a_frame_count_as_one_frame(is_many: bool) -> None:
+def test_the_parts_of_a_frame_count_as_one_frame_and_one_without_marks_as_none(is_many: bool) -> None:
     marks = [ComparatorPoint(i, "1", "fiducial", np.zeros(2), np.ones(2), 0.0, Status.MEASURED, "") for i in "lrw"]
-    data = ReportData("Halves", marks, part_of={"l": "f", "r": "f", "w": ""})
-    counts = {image: Counter[str]({Status.MEASURED: 1}) for image in "lrw"}
+    absent = ComparatorPoint("e", "1", "fiducial", None, None, 0.0, Status.ABSENT, "")
+    data = ReportData("Halves", [*marks, absent], part_of={"l": "f", "r": "f", "w": ""})
+    counts = {image: Counter[str]({Status.MEASURED: int(image != "e")}) for image in "lrwe"}
     totals = FrameTotals(counts, {}, {}, (), {"col": np.zeros(0), "row": np.zeros(0)}) if is_many else None
     assert judge(replace(data, totals=totals)).sentence.startswith("Measured: 3 marks in 2 frames")
 
