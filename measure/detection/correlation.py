@@ -65,9 +65,9 @@ class Surroundings:
         detail /= np.sqrt(variance, out=variance)
         return np.clip(detail, -_CLIP, _CLIP, out=detail)
 
-    def pattern(self, template: Array, detail_px: float, image: Map) -> tuple[Map, Map]:
-        """Convert a template to the zero-mean pattern correlated with a flattened image, and its mask: 1 on the drawing
-        and around it, or on all known pixels if the template has no known rim; 0 elsewhere and for nan pixels."""
+    def mask(self, template: Array, detail_px: float) -> Map:
+        """Mask of a template: 1 on the drawing and around it, or on all known pixels if its rim is not known; 0
+        elsewhere and for nan pixels."""
         about = ~np.isnan(template)
         rim = np.concatenate([template[0], template[-1], template[:, 0], template[:, -1]])
         if not np.isnan(rim).all():  # only the drawing and its surroundings
@@ -75,12 +75,15 @@ class Surroundings:
             # A line far thinner than a pixel has almost no contrast left.
             background = (drawn < min(_DRAWN, float(drawn.max()) / 2)).astype(np.uint8)
             about &= cv2.distanceTransform(background, cv2.DIST_L2, 5) <= self.margin * detail_px + 1
-        mask = np.asarray(about, np.float32)
+        return np.asarray(about, np.float32)
+
+    def pattern(self, template: Array, detail_px: float, mask: Map, image: Map) -> Map:
+        """Convert a template to the zero-mean pattern that is correlated with a flattened image under a mask."""
         template = np.nan_to_num(template)
         chip = np.asarray(template - cv2.GaussianBlur(template, (0, 0), self.coarse * detail_px), np.float32)
         if self.whitened:
             chip = np.asarray(cv2.filter2D(chip, -1, _inverse_covariance(image)), np.float32)
-        return mask * (chip - np.average(chip, weights=mask)), mask
+        return mask * (chip - np.average(chip, weights=mask))
 
 
 def variation(image: Map, about: Map) -> Map:
@@ -99,7 +102,7 @@ def correlation(image: Map, chip: Map, about: Map, varied: Map | None = None) ->
     Parameters
     ----------
     image : (rows, columns) flattened image.
-    chip, about : (rows, columns) pattern and mask of `Surroundings.pattern`. The mask excludes the frame's edge or
+    chip, about : (rows, columns) pattern and mask of `Surroundings`. The mask excludes the frame's edge or
         writing around the drawing.
     varied : variation of the image under the mask, shared by patterns with the same mask.
     """

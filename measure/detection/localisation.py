@@ -111,7 +111,8 @@ class PeakSearch:
         window = scan.reduced_window(reduction, *wide, expected.weights)
         flattened = surroundings.flatten(window, finest_px, scan.full_scale_dn * FAINT)
         self._flat = expected.polarity * flattened[rim:-rim, rim:-rim]
-        self._pattern, self._counts = surroundings.pattern(template, finest_px, self._flat)
+        self._counts = surroundings.mask(template, finest_px)
+        self._pattern = surroundings.pattern(template, finest_px, self._counts, self._flat)
         response = correlation(self._flat, self._pattern, self._counts)
         first = np.array(wide[:2]) + rim - low  # place of the first response
         rows, cols = np.indices(response.shape)

@@ -38,8 +38,8 @@ _CANDIDATES = 100  # largest number per template
 _BACKGROUND_PERCENT = 95  # percentile of the NCC that defines the background's response
 _LEAST_BACKGROUND = 0.5  # fraction of the map taken for background at least
 _SAMPLED = slice(None, None, 3)  # subsampling for that estimate, since neighbours are correlated
-_MOST_CACHED = 768 << 20  # bytes, enough for four different marks in a large scan
-_SMALL_MAPS = 32  # maps of a small scan at full resolution
+_MOST_CACHED = 256 << 20  # bytes, enough for four different marks in an orientation of a large scan
+_SMALL_MAPS = 14  # maps of a small scan at full resolution: four different marks in an orientation
 _LEAST_CACHED = 32 << 20  # bytes
 _STEP = 1 / 32767  # NCC, of dilated maps: at 16 bits they take half the memory
 _ROUNDING = 1e-9  # of the elements of a turn by a quarter
@@ -103,17 +103,21 @@ class Templates:
     ----------
     images : one per kind; nan where a mark is not known.
     details_px : width of the finest structure that is not background, px of the reduced scan, one per kind.
+    masks : one per kind; equal ones are the same array.
+    surroundings : treatment of the background, which makes the masks.
     kinds : of the template of each view.
     reduction : factor by which the scan is reduced.
     """
 
     images: Sequence[Array]
     details_px: Sequence[float]
+    masks: Sequence[Map]
+    surroundings: Surroundings
     kinds: tuple[int, ...]
     reduction: int
 
     @classmethod
-    def render(cls, scan: Scan, views: Sequence[MarkView], half_px: int) -> "Templates":
+    def render(cls, scan: Scan, views: Sequence[MarkView], half_px: int, surroundings: Surroundings) -> "Templates":
         """Render mark views. half_px: largest half size of the template of a cross, px of the reduced scan."""
         reduction = _search_reduction(scan, views)
         images = _images(views, reduction, half_px)
@@ -130,7 +134,11 @@ class Templates:
         for view in (views[kinds.index(kind)] for kind in range(len(first))):
             wide = _LEARNED if isinstance(view.mark, MarkTemplate) else 1.0
             details.append(max(wide * detail_px(view.mark, view.linear) / reduction, 1.0))
-        return cls([own[number] for number in first], details, kinds, reduction)
+        images = [own[number] for number in first]
+        masks = [surroundings.mask(*each) for each in zip(images, details, strict=True)]
+        distinct = {(mask.shape, mask.tobytes()): mask for mask in masks}
+        masks = [distinct[mask.shape, mask.tobytes()] for mask in masks]
+        return cls(images, details, masks, surroundings, kinds, reduction)
 
     @property
     def half_px(self) -> int:
@@ -199,14 +207,13 @@ class CorrelationMaps(Mapping[Key, Map]):
         channels: Sequence[Callable[[], Map]],
         templates: Templates,
         signs: Collection[int],
-        surroundings: Surroundings,
         faint_dn: float,
         cache: ByteCache,
     ) -> None:
         """channels: functions that make images which exceed the maps by the templates' half_px; faint_dn: contrast at
         the level of rounding."""
         self._channels, self._templates, self._signs, self._cache = channels, templates, tuple(signs), cache
-        self._surroundings, self._faint_dn = surroundings, faint_dn
+        self._faint_dn = faint_dn
         self._own = object()  # identifies these maps in the cache; self would create a reference cycle
 
     def __getitem__(self, key: Key) -> Map:
@@ -221,33 +228,40 @@ class CorrelationMaps(Mapping[Key, Map]):
         return len(self._templates.images) * len(self._signs)
 
     def _extremes(self, kind: int) -> Map:
-        """(1 or 2, rows, columns) largest and least correlation of a kind over all channels; of one channel both are
-        the same."""
-        image, detail = self._templates.images[kind], self._templates.details_px[kind]
-        margin = self._templates.half_px - len(image) // 2
-        extremes = None
-        for number, channel in enumerate(self._channels):
-            # Kinds of equal detail share the flattened image, kinds with equal masks its variation under them.
-            key = self._own, number, detail
-            flat = self._shared(key, partial(self._flatten, channel, detail))
-            chip, mask = self._surroundings.pattern(image, detail, flat)
-            varied = self._shared((key, mask.tobytes()), partial(variation, flat, mask))
-            response = correlation(flat, chip, mask, varied)
-            rows, cols = (slice(margin, side - margin) for side in response.shape)
-            own = response[rows, cols]
-            if extremes is None:
-                extremes = own[None]
-            else:
-                extremes = np.stack([np.maximum(extremes[0], own), np.minimum(extremes[-1], own)])
-        assert extremes is not None
+        """(1 or 2, rows, columns) largest and least correlation of a kind over all channels, as the signs ask for; of
+        one channel both are the same."""
+        first = self._response(kind, 0)
+        if len(self._channels) == 1:
+            return first[None]
+        reduce = [extreme for sign, extreme in ((1, np.maximum), (-1, np.minimum)) if sign in self._signs]
+        extremes = np.stack([first] * len(reduce))
+        for channel in range(1, len(self._channels)):
+            response = self._response(kind, channel)
+            for extreme, own in zip(reduce, extremes, strict=True):
+                extreme(own, response, out=own)
         return extremes
 
-    def _flatten(self, channel: Callable[[], Map], detail_px: float) -> Map:
-        return self._surroundings.flatten(channel(), detail_px, self._faint_dn)
+    def _response(self, kind: int, channel: int) -> Map:
+        """Correlation of a kind with a channel."""
+        templates = self._templates
+        image, detail, mask = templates.images[kind], templates.details_px[kind], templates.masks[kind]
+        # Kinds of equal detail share the flattened image, kinds with equal masks its variation under them.
+        alike = [other is mask for px, other in zip(templates.details_px, templates.masks, strict=True) if px == detail]
+        key = self._own, channel, detail
+        flat = self._kept(key, len(alike), partial(self._flatten, channel, detail))
+        chip = templates.surroundings.pattern(image, detail, mask, flat)
+        varied = self._kept((key, id(mask)), sum(alike), partial(variation, flat, mask))
+        response = correlation(flat, chip, mask, varied)
+        margin = templates.half_px - len(image) // 2
+        rows, cols = (slice(margin, side - margin) for side in response.shape)
+        return response[rows, cols]
 
-    def _shared(self, key: Hashable, make: Callable[[], Map]) -> Map:
-        """Value that several kinds share; a single kind needs it once."""
-        return self._cache.get(key, make) if len(self._templates.images) > 1 else make()
+    def _flatten(self, channel: int, detail_px: float) -> Map:
+        return self._templates.surroundings.flatten(self._channels[channel](), detail_px, self._faint_dn)
+
+    def _kept(self, key: Hashable, kinds: int, make: Callable[[], Map]) -> Map:
+        """Value that so many kinds share; a single kind needs it once."""
+        return self._cache.get(key, make) if kinds > 1 else make()
 
 
 class Dilation:
@@ -362,7 +376,7 @@ def correlate_scan(
     half_px : largest half size of the template of a cross, px of the reduced scan.
     marks : number of marks in the frame.
     """
-    templates = Templates.render(scan, views, half_px)
+    templates = Templates.render(scan, views, half_px, surroundings)
     half = (templates.half_px,) * 4
 
     def bordered(weights: Sequence[float]) -> Map:
@@ -370,7 +384,7 @@ def correlate_scan(
         return np.asarray(cv2.copyMakeBorder(grey, *half, cv2.BORDER_REPLICATE), np.float32)
 
     channels = [partial(bordered, weights) for weights in _channels(scan)]
-    maps = CorrelationMaps(channels, templates, signs, surroundings, scan.full_scale_dn * FAINT, cache)
+    maps = CorrelationMaps(channels, templates, signs, scan.full_scale_dn * FAINT, cache)
     return Responses(maps, templates.kinds, templates.reduction, cache, None, surroundings, marks)
 
 
@@ -387,7 +401,7 @@ def correlate_windows(
 
     Only these windows of the file are read. A kind is a template at one place.
     """
-    templates = Templates.render(scan, views, half_px)
+    templates = Templates.render(scan, views, half_px, WIDE)
     reduction, half = templates.reduction, templates.half_px
     reach = int(np.ceil(reach_px / reduction))
     # Row by row, so that file strips shared by windows are still decoded for the next one.
@@ -403,7 +417,7 @@ def correlate_windows(
         window = reduction, col0, row0, size, size
         channels = [partial(scan.reduced_window, *window, weights) for weights in _channels(scan)]
         own_cache = ByteCache(_MOST_CACHED)
-        maps = CorrelationMaps(channels, templates, signs, WIDE, scan.full_scale_dn * FAINT, own_cache)
+        maps = CorrelationMaps(channels, templates, signs, scan.full_scale_dn * FAINT, own_cache)
         own = (pair for pair in kinds if pair[0] == corner)
         return {(kinds.index(pair), sign): maps[pair[1], sign] for pair in own for sign in signs}
 

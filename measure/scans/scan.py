@@ -73,7 +73,7 @@ class Scan:
         self._segments = segments
         self._cache = SegmentCache(segments)
         self._source = segments if isinstance(segments, RawRows) else self._cache
-        self._reduced: dict[int, Single] = {}
+        self._reduced: dict[int, Samples | Single] = {}
         self._overviews = [Scan(path, own, pitch) for own in opened.overviews]
         self.weights: Sequence[float] = (1.0,) if self.channels == 1 else LUMINANCE
 
@@ -311,13 +311,14 @@ class Scan:
         is_coarser = unit * step_dn > _PLAINLY_COARSER * self._segments.quantisation_step_dn
         return (unit * step_dn, ((col0 + col) % BLOCK_PX, (row0 + row) % BLOCK_PX)) if is_coarser else none
 
-    def _reduced_channels(self, factor: int, width: int, height: int) -> Single:
-        """(height, width, channels) reduction of the whole scan; every segment is decoded once."""
+    def _reduced_channels(self, factor: int, width: int, height: int) -> Samples | Single:
+        """(height, width, channels) reduction of the whole scan, stored values at full size; every segment is decoded
+        once."""
         if overview := self._overview(factor):
             whole, scale, shift = overview._steps_to(self, factor)
             picture = overview._reduced_channels(whole, overview.width_px // whole, overview.height_px // whole)
-            return _interpolated(picture, scale, shift, width, height)
-        result = np.empty((height, width, self.channels), np.float32)
+            return _interpolated(np.asarray(picture, np.float32), scale, shift, width, height)
+        result = np.empty((height, width, self.channels), np.float32 if factor > 1 else self.samples_dtype)
         tall, wide = self.segment_px
         cols = width if wide >= self.width_px else _reduced_side(wide, factor, _PART_PX)
         rows = _reduced_side(tall, factor, max(_PART_PX**2 // (cols * factor), 1))
@@ -406,5 +407,6 @@ def weighted(samples: Samples | Single, weights: Sequence[float]) -> Single:
     if weights[0] != 1.0:
         grey *= weights[0]
     for channel in range(1, samples.shape[-1]):
-        grey += weights[channel] * samples[..., channel]
+        if weights[channel]:
+            grey += weights[channel] * samples[..., channel]
     return grey

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,12 +17,14 @@ from measure.marks import shapes
 from measure.marks.rendering import extent_px
 from pipeline.errors import InputError
 from pipeline.files import camera_tables
-from pipeline.files.earlier_calibration import EarlierCalibration, read_calibration
 from pipeline.files.mark_table import Clicks, Drawing, LearnedFrom, SavePicture, read_marks, template_values
 from pipeline.text.files import SMALLEST_SIGMA, FilePath, image_name
 from pipeline.text.table_models import read_model
 from pipeline.text.toml_tables import Table, list_words, read_toml
 from pipeline.text.wording import did_you_mean, table_lines
+
+if TYPE_CHECKING:
+    from pipeline.files.earlier_calibration import EarlierCalibration
 
 FIELD_RATIO = 50.0  # largest half diagonal over principal distance, or frame over fiducials' extent: 178° field of view
 LONGEST_RATIO = 500.0  # largest principal distance over half the diagonal: small plates of astrographs with c = 10 m
@@ -96,7 +98,7 @@ class CameraFile:
     fiducials: tuple[GivenFiducial, ...]
     number: str = ""
     writing: tuple[shapes.WrittenPlace, ...] = ()
-    calibration: EarlierCalibration | None = None
+    calibration: "EarlierCalibration | None" = None
     source: camera_tables.Source | None = None
     clicks: Clicks | None = None
     learned_from: LearnedFrom | None = None
@@ -202,7 +204,13 @@ def parse_camera(table: Table) -> CameraFile:
         learned_from=given.learned_from,
         distances=fiducial_distances(distances, given.fiducial_distance, [one.id for one in fiducials]),
     )
-    return replace(camera, calibration=read_calibration(table.table("sigma"), given.sigma, camera.camera()))
+    if given.sigma.calibration is None:
+        return camera
+    from pipeline.files.earlier_calibration import read_calibration  # a quarter of the start of `cameras --scan`
+
+    earlier = table.file.parent / given.sigma.calibration
+    calibration = read_calibration(earlier, table.table("sigma"), given.sigma.calibration_fiducials, camera.camera())
+    return replace(camera, calibration=calibration)
 
 
 def _check_units(

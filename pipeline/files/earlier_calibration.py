@@ -12,7 +12,6 @@ from adjust.functional_model.lens import INTERIOR_NAMES, Distortion, Prior
 from adjust.problem.camera import Camera, Fiducial
 from adjust.problem.observations import Calibration
 from adjust.problem.parameter import Parameter
-from pipeline.files.camera_tables import SigmaTable
 from pipeline.results.adjustment_file import ParameterCovariance, covariance_path, read_adjustment, read_covariance
 from pipeline.results.adjustment_record import CameraRecord, DistortionRecord
 from pipeline.text.toml_tables import Table
@@ -66,14 +65,12 @@ class EarlierCalibration:
         return free, Calibration(here, self.values, self.covariance)
 
 
-def read_calibration(sigma: Table, given: SigmaTable, camera: Camera) -> EarlierCalibration | None:
-    """Earlier calibration that the table [sigma] of a camera file names; None where it names none.
+def read_calibration(path: Path, sigma: Table, fiducials_too: bool, camera: Camera) -> EarlierCalibration:
+    """Read the earlier calibration that the table [sigma] of a camera file names.
 
-    Raises InputError where the file has no calibration of this camera, or another lens model.
+    fiducials_too: whether it says where the fiducials are. Raises InputError where the file has no calibration of this
+    camera, or another lens model.
     """
-    if given.calibration is None:
-        return None
-    path = sigma.file.parent / given.calibration
     content, covariance = read_adjustment(path), read_covariance(path)
     if not content.converged:
         raise sigma.error("calibration", f"{path} holds no calibration: its adjustment did not converge.")
@@ -86,7 +83,7 @@ def read_calibration(sigma: Table, given: SigmaTable, camera: Camera) -> Earlier
     name = camera.name if camera.name in names else names[0]
     distortion = content.cameras[name].distortion
     _check_family(sigma, path, distortion, camera.distortion)
-    earlier = _calibration(path, covariance, name, camera, given.calibration_fiducials)
+    earlier = _calibration(path, covariance, name, camera, fiducials_too)
     if not np.isfinite(earlier.values).all():
         raise sigma.error("calibration", f"{path} holds no interior orientation: it was made without object points.")
     _check_agreement(sigma, path, name, content.cameras[name], covariance)

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -19,9 +20,11 @@ from measure.marks.rendering import known_picture
 from measure.marks.shapes import FiducialLayout, LayoutMark, is_made_of_areas
 from measure.results import MarkMeasurement
 from pipeline.files.camera_file import CameraFile
-from pipeline.measuring.scan_task import ScanTask
-from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import counted
+
+if TYPE_CHECKING:
+    from pipeline.measuring.scan_task import ScanTask
+    from pipeline.results.measured_record import MeasuredScan
 
 _OTHER_CONE = 0.02  # fraction of the principal distance: cameras with the same lens cone differ by less
 _MAKERS = ("Wild", "Zeiss", "Jena", "Fairchild")
@@ -70,8 +73,8 @@ def contradictions(camera: CameraFile, plate: dict[str, str]) -> list[str]:
 
 
 def add_plates(
-    camera: CameraFile, scans: Sequence[MeasuredScan], cameras: Mapping[str, CameraFile]
-) -> list[MeasuredScan]:
+    camera: CameraFile, scans: "Sequence[MeasuredScan]", cameras: Mapping[str, CameraFile]
+) -> "list[MeasuredScan]":
     """Add the contradictions and notes of the camera plates to the scans of one camera.
 
     A principal distance read from a plate changes nothing.
@@ -109,7 +112,7 @@ def add_plates(
 
 
 def fitting_cameras(
-    camera: CameraFile, scans: Sequence[MeasuredScan], cameras: Mapping[str, CameraFile], film_mm: float
+    camera: CameraFile, scans: "Sequence[MeasuredScan]", cameras: Mapping[str, CameraFile], film_mm: float
 ) -> dict[str, Reason]:
     """Find scans of one camera whose fiducials fit another camera of the project and not their own, by image.
 
@@ -141,10 +144,10 @@ def fitting_cameras(
 
 
 def tried_cameras(
-    scans: Sequence[MeasuredScan],
-    tasks: Sequence[ScanTask],
+    scans: "Sequence[MeasuredScan]",
+    tasks: "Sequence[ScanTask]",
     cameras: Mapping[str, CameraFile],
-    measure: Callable[[Sequence[ScanTask]], Iterable[MeasuredScan]],
+    measure: "Callable[[Sequence[ScanTask]], Iterable[MeasuredScan]]",
 ) -> dict[str, Reason]:
     """Measure scans of one camera without a frame as those of others; the camera with all fiducials, by image.
 

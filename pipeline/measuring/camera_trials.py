@@ -79,7 +79,7 @@ def identify(
     with reporter.stage("trying layout") as count:
         trials, tries, is_negative = list[Trial](), dict[Names, Tried](), False
         for attempt in _attempts(search, layouts, _layouts_like(layouts, likely), pitch, count):
-            tried = _trials(search, attempt.tries, count)
+            tried = _trials(search, attempt.tries, attempt.most, count)
             ends = attempt.is_last(tried)
             if ends or not attempt.is_negative:
                 trials, tries, is_negative = tried, attempt.tries, attempt.is_negative
@@ -229,8 +229,8 @@ def _any_pitch_tries(search: LayoutSearch, layouts: Mapping[Names, FiducialLayou
     return tries | best
 
 
-def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) -> list[Trial]:
-    """Try the layouts in order of their expected false alarms."""
+def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], most: float, count: Count) -> list[Trial]:
+    """Try the layouts in order of their expected false alarms. most: as of `_Attempt`, which no other one ends."""
     # Once a layout stands out, others are measured only if they are significant and may hold more marks.
     trials: list[Trial] = []
     # By two digits of these; among equals (layouts with the same corners) the fewest marks first.
@@ -239,11 +239,11 @@ def _trials(search: LayoutSearch, tries: Mapping[Names, Tried], count: Count) ->
     for done, names in enumerate(ranked, 1):
         each, standing = tries[names], [trial for trial in trials if trial.stands_out]
         drawn, expected = len(each.layout.marks), each.answer.expected
-        limit = _HOPELESS
+        limit = min(most, _HOPELESS)
         for trial in standing:
-            most = MAX_FALSE_CAMERAS if trial.expected <= MAX_FALSE_CAMERAS else _BY_CHANCE
+            least = MAX_FALSE_CAMERAS if trial.expected <= MAX_FALSE_CAMERAS else _BY_CHANCE
             # Fewer marks may be a part of those found: nine crosses of a larger réseau match a layout of nine.
-            limit = min(limit, most, _ODDS * trial.expected if trial.found > drawn else most)
+            limit = min(limit, least, _ODDS * trial.expected if trial.found > drawn else least)
         if expected > limit:
             why = "no constellation of its marks correlates anywhere in the scan"
             if np.isfinite(expected):

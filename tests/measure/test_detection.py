@@ -14,7 +14,7 @@ from true_marks import KIND, some_mark
 from measure import FiducialOptions, MatchOptions
 from measure.detection.correlation import CLOSE, GRAINY, Map, Surroundings, correlation
 from measure.detection.localisation import MarkPrediction, localise
-from measure.detection.responses import ByteCache, Responses
+from measure.detection.responses import ByteCache, MarkView, Responses, correlate_scan
 from measure.detection.significance import chance_of_marks, expected_peaks, share_of_places
 from measure.fiducials.faint_marks import FaintMark, detect_faint
 from measure.fiducials.mark_fit import detect_mark
@@ -223,7 +223,8 @@ def responses_to(
 ) -> Map:
     """The correlation of a picture, freed of its ground, with a template."""
     flat = surroundings.flatten(grey.astype(np.float32), detail_px, faint_dn)
-    return correlation(flat, *surroundings.pattern(template, detail_px, flat))
+    mask = surroundings.mask(template, detail_px)
+    return correlation(flat, surroundings.pattern(template, detail_px, mask, flat), mask)
 
 
 MAP = np.random.default_rng(5).normal(size=(40, 50)).astype(np.float32)
@@ -239,6 +240,23 @@ def test_responses_are_freed_with_the_search_and_not_by_the_next_garbage_collect
         assert alive() is None
     finally:
         gc.enable()
+
+
+def test_unlike_dark_marks_of_a_colour_scan_keep_one_map_each() -> None:
+    """Marks that only blue shows. A lighter mark is not asked for, and the marks share no mask."""
+    marks = [MarkShape(cross(1.0, 0.2), "dark"), MarkShape(polygon([(0.0, 0.0), (1.6, 0.5), (1.6, -0.5)]), "dark")]
+    linear, places = np.diag([10.0, -10.0]), [(40.0, 60.0), (90.0, 50.0)]
+    grey = np.random.default_rng(3).normal(30000.0, 500.0, (110, 130, 3))
+    for mark, place in zip(marks, places, strict=True):
+        grey[..., 2] -= 20000.0 * brute_picture(mark, np.column_stack([linear, place]), 130, 110, 0.6)
+    cache = ByteCache(1 << 30)
+    views = [MarkView(mark, linear) for mark in marks]
+    responses = correlate_scan(make_scan(grey), views, {-1}, CLOSE, cache, 1000, 4)
+    for kind, place in zip(responses.kinds, places, strict=True):
+        map_ = responses.maps[kind, -1]
+        assert np.unravel_index(map_.argmax(), map_.shape)[::-1] == place
+        assert map_.max() > 0.6
+    assert sum(each.nbytes for each in cache._entries.values()) == 2 * 4 * 110 * 130
 
 
 def test_lines_as_fine_as_the_grain_answer_at_closer_matching_by_what_the_grain_hides_least() -> None:

@@ -38,7 +38,7 @@ from pipeline.files import library
 from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.library import library_names, library_path, read_library
 from pipeline.measuring.camera_identification import Identification, Trial, drawn_alike
-from pipeline.measuring.camera_trials import _alike, _attempts, identify
+from pipeline.measuring.camera_trials import _alike, _attempts, _trials, identify
 from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import render_project
 
@@ -517,6 +517,15 @@ def test_without_a_pitch_lattices_come_first_and_end_the_search_if_most_of_one_i
     assert next(attempts).tries.keys() == layouts.keys()
     faint = FakeSearch({25: 0.02})
     assert next(_attempts(cast(LayoutSearch, faint), layouts, {}, None, no_count)).tries.keys() == layouts.keys()
+
+
+def test_marks_of_a_negative_that_is_not_significant_are_not_measured() -> None:
+    """It would not end the search. The search of the test cannot measure anything."""
+    search, layout = cast(LayoutSearch, FakeSearch({4: 0.02})), LIBRARY["wild-rc5-153"].layout()
+    last = [*_attempts(search, {("wild-rc5-153",): layout}, {}, None, no_count)][-1]
+    assert last.is_negative
+    (tried,) = _trials(search, last.tries, last.most, no_count)
+    assert tried.reason == "not measured: 0.02 false alarms expected in such a scan"
 
 
 def test_marks_finer_than_the_pixels_are_not_those_of_a_camera(tmp_path: Path) -> None:
