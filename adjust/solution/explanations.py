@@ -61,11 +61,16 @@ LEAST_SHARE = 0.05  # of v'Pv; further lens terms remove up to 0.02 on real boar
 FREED = 1e6  # factor on variances at first that leave the given points no redundancy
 SETTLED = 1.0  # fall of v'Pv below which displacements need not be found anew: as small as the noise of one residual
 TURNS = 8  # adjustments, each with the variance of the one before
-ENDING = ("groups", "distances", "affinities")  # after which nothing else is sought
+ENDING = ("groups", "distances", "principal points", "affinities")  # after which nothing else is sought
 OF_IMAGES = ("radial", "decentering", "bow", "pixels", "shear", "drift", "jump", "interior", "groups", "distances")
 OF_POINTS = ("board", "disks", "point")
 # Kinds of hypotheses with unknowns for every image, and the simpler ones that may explain as much.
-GENERAL = {"distances": ("drift", "groups"), "affinities": OF_IMAGES + OF_POINTS, "film": ("pixels", "single film")}
+GENERAL = {
+    "distances": ("drift", "groups"),
+    "principal points": OF_IMAGES + OF_POINTS,
+    "affinities": (*OF_IMAGES, *OF_POINTS, "principal points"),
+    "film": ("pixels", "single film"),
+}
 GIVEN_LOOSELY = ("datum", "interior")  # groups of priors
 FEWEST = 30  # coordinates needed to test the distribution of residuals
 NOISE_LEVEL = 0.001  # significance level of each test of the noise hypothesis

@@ -469,26 +469,29 @@ def _wrong_interior_orientation(run: Run, camera: Camera) -> Iterator[ModelHypot
 
 
 def _interior_orientations(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
-    """Another interior orientation for some of the camera's images, or another principal distance for each."""
+    """Another interior orientation for some of the camera's images, or another principal distance or point for each."""
     equations = partitions.interior_equations(run, camera.name)
     if (groups := partitions.two_groups(run, camera.name, equations)) is not None:
         who = f"the images {shortened(groups.names, NAMED)} ({len(groups.names)} of {len(equations.names)})"
-        problem, added = _separate_cameras(
-            run, camera, dict.fromkeys(groups.names, camera.name + OTHERS), len(INTERIOR_NAMES)
-        )
+        others = dict.fromkeys(groups.names, camera.name + OTHERS)
+        problem, added = _separate_cameras(run, camera, others, slice(0, 3))
         shown = np.concatenate([added, problem.unknowns.camera[camera.name][: len(INTERIOR_NAMES)]])
         words = partial(group_words, f"{who} of camera {camera.name}")
         yield ModelHypothesis("groups", words, problem, added, selection=groups, shown=shown)
-    if (images := partitions.own_distances(run, equations)) is not None:
+    for part, images in partitions.own_interiors(run, equations):
         others = {name: f"{camera.name}, {name}{OTHERS}" for name in images.names}
-        problem, added = _separate_cameras(run, camera, others, 1)
-        shown = np.append(problem.unknowns.camera[camera.name][:1], added)
-        words = partial(_distance_words, camera.name, equations.names)
-        yield ModelHypothesis("distances", words, problem, added, selection=images, shown=shown)
+        problem, added = _separate_cameras(run, camera, others, part)
+        shown = np.append(problem.unknowns.camera[camera.name][part], added)
+        if part.start == 0:
+            words = partial(_distance_words, camera.name, equations.names)
+            yield ModelHypothesis("distances", words, problem, added, selection=images, shown=shown)
+        elif not camera.fiducials:
+            words = partial(_principal_point_words, camera, equations.names)
+            yield ModelHypothesis("principal points", words, problem, added, selection=images, shown=shown)
 
 
-def _separate_cameras(run: Run, camera: Camera, others: Mapping[str, str], count: int) -> tuple[Problem, Indices]:
-    """Give some frames cameras of other names that differ in the first `count` quantities; also return these."""
+def _separate_cameras(run: Run, camera: Camera, others: Mapping[str, str], part: slice) -> tuple[Problem, Indices]:
+    """Give some frames cameras of other names that differ in a part of INTERIOR_NAMES; also return these unknowns."""
     network, names = run.problem.network, dict.fromkeys(others.values(), camera.name)
     images = tuple(replace(each, camera=others.get(each.frame, each.camera)) for each in network.images)
     cameras = (*network.cameras, *(replace(camera, name=name) for name in names))
@@ -497,17 +500,18 @@ def _separate_cameras(run: Run, camera: Camera, others: Mapping[str, str], count
     given, sigma, start = unknowns.given.copy(), unknowns.sigma.copy(), unknowns.start.copy()
     of_camera, fiducial, own = dict(unknowns.camera), dict(unknowns.fiducial), unknowns.camera[camera.name]
     for name in names:
-        free = of_camera[name][:count]
-        given[free], sigma[free], start[free] = np.nan, np.inf, start[own[:count]]
+        free = of_camera[name][part]
         # All else, and the fiducial marks, are those of the camera.
-        sigma[of_camera[name][count:]] = 0.0
-        of_camera[name] = np.concatenate([free, own[count:]])
+        sigma[of_camera[name]] = 0.0
+        given[free], sigma[free], start[free] = np.nan, np.inf, start[own[part]]
+        of_camera[name] = own.copy()
+        of_camera[name][part] = free
         for (owner, id_), pair in unknowns.fiducial.items():
             if owner == name:
                 sigma[pair] = 0.0
                 fiducial[name, id_] = fiducial[camera.name, id_]
     shared = replace(unknowns, given=given, sigma=sigma, start=start, camera=of_camera, fiducial=fiducial)
-    return replace(problem, unknowns=shared), np.concatenate([of_camera[name][:count] for name in names])
+    return replace(problem, unknowns=shared), np.concatenate([of_camera[name][part] for name in names])
 
 
 def _distance_words(camera: str, images: Sequence[str], found: Estimate) -> tuple[str, str]:
@@ -519,6 +523,20 @@ def _distance_words(camera: str, images: Sequence[str], found: Estimate) -> tupl
         f"The principal distance of camera {camera} differs from image to image, by {100.0 * longer:.3g} ± "
         f"{100.0 * sigma:.1g} % between {images[first]} and {images[last]}: focus or zoom changed",
         REFOCUSED,
+    )
+
+
+def _principal_point_words(camera: Camera, images: Sequence[str], found: Estimate) -> tuple[str, str]:
+    """Describe principal points of the images by their scatter and the two that lie farthest apart."""
+    per_mm, unit = camera.image_unit()
+    xy, sigma = per_mm * found.value.reshape(-1, 2), np.abs(per_mm) * found.sigma.reshape(-1, 2)
+    axis = int(np.argmax(np.ptp(xy, axis=0)))
+    first, last = np.argsort(xy[:, axis])[[0, -1]]
+    return (
+        f"The principal point of camera {camera.name} differs from image to image, by {np.ptp(xy[:, axis]):.3g} ± "
+        f"{np.hypot(*sigma[[first, last], axis]):.1g} {unit} in {'xy'[axis]} between {images[first]} and "
+        f"{images[last]}: lens or sensor moved, or pictures are cropped each otherwise",
+        "Switch stabilisation off, hold the lens, use pictures as the camera takes them, and take them again.",
     )
 
 

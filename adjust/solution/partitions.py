@@ -58,23 +58,28 @@ class InteriorEquations(NamedTuple):
     right: Array
 
 
-def own_distances(run: Run, equations: InteriorEquations) -> Selection | None:
-    """Select all frames of a camera but the first for a principal distance of their own; None where they need none."""
+def own_interiors(run: Run, equations: InteriorEquations) -> Iterator[tuple[slice, Selection]]:
+    """Select all frames of a camera but the first for principal distances (INTERIOR_NAMES[:1]), or for principal points
+    ([1:]), of their own, where they need them."""
     names, normal, right = equations
     count = len(names) - 1
-    # Decrease of v'Pv by changes of each image's own in place of common ones: Cochran's Q.
-    of_distances, of_all = (
-        float(quadratic(n, g).sum() - quadratic(n.sum(axis=0), g.sum(axis=0)))
-        for n, g in ((normal[:, :1, :1], right[:, :1]), (normal, right))
-    )
+    if count < 1:
+        return
     vpv, redundancy = run.group_sums(run.weighting.used)
     variance = max(1.0, vpv / redundancy)
-    if count < 1 or chdtrc(count, of_distances / variance) > LEVEL:
-        return None
+
+    def fall(part: slice) -> float:
+        """Decrease of v'Pv by changes of each image's own in place of common ones: Cochran's Q."""
+        n, g = normal[:, part, part], right[:, part]
+        return float(quadratic(n, g).sum() - quadratic(n.sum(axis=0), g.sum(axis=0)))
+
+    distances, points = slice(0, 1), slice(1, 3)
     # Errors that are correlated within images make principal points scatter as well.
-    of_points = max((of_all - of_distances) / (2.0 * count), variance)
-    p = float(fdtrc(count, 2.0 * count, of_distances / count / of_points))
-    return Selection(names[1:], p_scatter=p)
+    of_points = max((fall(slice(0, 3)) - fall(distances)) / (2.0 * count), variance)
+    p = float(fdtrc(count, 2.0 * count, fall(distances) / count / of_points))
+    for part, size, p_scatter in ((distances, 1, p), (points, 2, 1.0)):
+        if chdtrc(size * count, fall(part) / variance) <= LEVEL:
+            yield part, Selection(names[1:], p_scatter=p_scatter)
 
 
 def two_groups(run: Run, camera: str, equations: InteriorEquations) -> Selection | None:

@@ -1058,3 +1058,21 @@ def test_neighbouring_views_are_no_copies_where_a_wrong_point_makes_residuals_la
     assert result.sigma0 > 100.0
     assert [each.kind for each in result.explanations] == ["point"]
     assert result.warnings == ()
+
+
+@parametrize_with_studies("seed", [*range(6, 14)], quick=(0, 1))
+def test_principal_points_of_the_images_own_are_named(seed: int) -> None:
+    """Groups of images, or images distorted each in its own way, had been blamed."""
+    made, rng = faults.scene(seed, flat=seed % 2 == 0), np.random.default_rng([seed, 5])
+    off_mm = rng.normal(0.0, 0.05, (len(made.stations), 2))
+    given = faults.misfit_network(made, faults.Effects(), SOUND, rng)
+    given = nets.set_observations(given, xy_mm=given.observations.xy_mm + off_mm[given.image_numbers])
+    result = adjust(given)
+    (found,) = result.explanations
+    assert found.kind == "principal points"
+    by, sigma, axis, *images = re.findall(r"by (\S+) ± (\S+) mm in (.) between im(\d+) and im(\d+): lens", found.cause)[
+        0
+    ]
+    assert (result.suspects, result.warnings) == ((), ())
+    (first, last), true_mm = map(int, images), off_mm[:, "xy".index(axis)]
+    assert abs(float(by) - (true_mm[last] - true_mm[first])) < 4.0 * float(sigma)
