@@ -57,7 +57,7 @@ GENEROUS = 2.0  # factor on the unmodelled standard deviation, for lens models w
 FEWEST_CORNERS = 4  # corners for a space resection with redundancy
 MOST_LOOKED_AT = 6  # pictures in which a board that was not found is recognised: the first ones may not show it
 
-MOST_PARTITIONS, DIFFERENT = 3, 0.001  # of images by their names that are tried; p-value of one camera
+MOST_PARTITIONS, DIFFERENT = 3, 1e-4  # of images by their names that are tried; p-value of one camera
 
 OUT = Path("calibration")
 LENSES: dict[str, LensSetting] = {"auto": "auto", **{model: model for model in get_args(LensModel)}}
@@ -201,9 +201,9 @@ class _CalibrationProject:
             for part, images in parts.items():
                 with suppress(AdjustmentError, InputError):
                     adjustment = adjust_marks(project, [mark for mark in marks if mark.image in images])
-                    found[part] = camera_intrinsics(adjustment, camera, self.options.pixel_mm, {}, None, None, None)
-            p = p_of_one_camera(list(found.values()))
-            if len(found) == len(parts) and p < DIFFERENT:
+                    if adjustment.converged:
+                        found[part] = camera_intrinsics(adjustment, camera, self.options.pixel_mm, {}, None, None, None)
+            if len(found) == len(parts) and (p := p_of_one_camera(list(found.values()))) < DIFFERENT:
                 each = "; ".join(f"*{part}*: {one.centre}" for part, one in found.items())
                 return (
                     "Pictures with different names are of different cameras, or of one refocused between them: that "

@@ -481,6 +481,7 @@ def test_pictures_of_two_cameras_are_told_apart_by_their_names(
     )
     said = written.cameras_by_name(camera, both)
     assert bool(said) == bool(apart_px)
+    assert not written.cameras_by_name(camera, [mark for mark in both if mark.point < "r1"])  # lines give no solution
     assert not said or re.search(r"\*leftp\*: .* cx 20[23]\.\d.*\*rightp\*: .* cx 19[01]\.\d", said)
 
 
