@@ -98,6 +98,7 @@ class ReportData:
     made_from : fingerprints of the files by name.
     given_by : source of the given fiducial coordinates by camera.
     stored_adjustment : of adjustment.json, where it is not shown: whether it is of the marks and settings.
+    image_cameras : camera's name by image, of the images with marks.
     part_of : frame by image, of images that show a part of it.
     totals : of all frames if these are many; comparator and measurement then hold only the frames shown.
     """
@@ -117,6 +118,7 @@ class ReportData:
     unit: str = "m"
     given_by: Mapping[str, str] = field(default_factory=dict)
     stored_adjustment: Literal["none", "current", "stale"] = "none"
+    image_cameras: Mapping[str, str] = field(default_factory=dict)
     part_of: Mapping[str, str] = field(default_factory=dict)
     totals: FrameTotals | None = None
 

@@ -1,5 +1,6 @@
 """Data of the report: the stages' results; of many frames only those that need a look, and totals of the others."""
 
+import os
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -130,7 +131,7 @@ def reduce_data(
 
 
 def _ending(scan: str) -> str:
-    return whole_file(scan).rpartition(".")[2].lower()
+    return os.path.splitext(whole_file(scan))[1][1:].lower() or "none"
 
 
 def _one_by_one(data: ReportData, scans: Iterable[MeasuredScan]) -> Iterator[ReportData]:
@@ -169,10 +170,9 @@ def verdict_counts(data: ReportData, shots: Sequence[ReportedFrame]) -> Mapping[
     """Numbers of frames by (camera, kind of file) and verdict."""
     if data.totals is not None:
         return data.totals.verdicts
-    stored, counts = data.adjustment, defaultdict[tuple[str, str], Counter[str]](Counter)
+    counts = defaultdict[tuple[str, str], Counter[str]](Counter)
     for frame in shots:
-        camera = stored.image_camera(frame.image) if stored and frame.image in stored.images else "none"
-        kind = camera, _ending(frame.scan.scan) if frame.scan else "given"
+        kind = data.image_cameras.get(frame.image, "none"), _ending(frame.scan.scan) if frame.scan else "given"
         counts[kind][frame.verdict] += 1
     return counts
 
@@ -202,6 +202,7 @@ def measured_data(
         pitch_um=pitch_um,
         frame_mm={camera.name: camera.frame_mm for camera in project.cameras.values() if camera.frame_mm is not None},
         unit=project.unit,
+        image_cameras={mark.image: project.image_camera(mark.image).name for mark in marks},
         part_of=project.given_images.part_of if project.given_images else {},
         given_by={camera.name: _coordinates_source(camera) for camera in project.cameras.values()},
         notes=tuple(filter(None, [outside_note(project), describe_decisions(read_decision_counts(comparator))])),

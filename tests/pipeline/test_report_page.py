@@ -25,6 +25,7 @@ from measure.results import FrameMeasurement
 from pipeline.report import ReportData, ReportedProblem, judge, render_report, write_report
 from pipeline.report.data import FrameTotals, ReportSection, frames
 from pipeline.report.frame_problems import fraction_test, places_px
+from pipeline.report.load import _ending, verdict_counts
 from pipeline.report.parameters import spoken_name
 from pipeline.report.verdict import critical_w, problems_by_test, sigma0_bounds
 from pipeline.results.adjustment_record import GivenQuantity, Quantity, Sigma0Record
@@ -609,6 +610,13 @@ def test_fiducials_that_another_scan_of_the_frame_shows_are_not_missing(frame: s
     left, right = frames(ReportData("Halves", [shown, absent], part_of=part_of))
     assert not left.marks[0].codes
     assert right.marks[0].needs_review is is_missing
+
+
+def test_frames_outside_of_the_adjustment_are_counted_with_their_camera_and_kind_of_file() -> None:
+    absent = [ComparatorPoint(image, "1", "fiducial", None, None, 0.0, Status.ABSENT, "") for image in "ab"]
+    data = ReportData("Box", absent, image_cameras={"a": "K", "b": "L"})
+    assert verdict_counts(data, frames(data)) == {("K", "given"): {"poor": 1}, ("L", "given"): {"poor": 1}}
+    assert [_ending(scan) for scan in ("../(none) w2", "../a.b/X.TIF", "s3://a.b/c.tif")] == ["none", "tif", "tif"]
 
 
 @pytest.mark.parametrize("is_many", [False, True])
