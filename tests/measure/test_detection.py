@@ -259,6 +259,17 @@ def test_unlike_dark_marks_of_a_colour_scan_keep_one_map_each() -> None:
     assert sum(each.nbytes for each in cache._entries.values()) == 2 * 4 * 110 * 130
 
 
+def test_dilated_maps_take_two_bytes_a_pixel_and_keep_their_heights() -> None:
+    """In large scans they are most of the memory; heights are correlations, rounded far below what noise does."""
+    map_ = (MAP / 4).clip(-1.0, 1.0)
+    dilated = Responses({(0, 1): map_}, (0,), 1, ByteCache(1 << 30)).dilated((0, 1), 2.0)
+    assert dilated.nbytes == 2 * map_.size
+    rows, cols = np.indices(map_.shape)
+    for col, row in ((20, 10), (7, 33), (0, 0)):
+        within = np.hypot(cols - col, rows - row) <= 2
+        assert dilated.height(np.array([col, row])) == pytest.approx(map_[within].max(), abs=5e-5)
+
+
 def test_lines_as_fine_as_the_grain_answer_at_closer_matching_by_what_the_grain_hides_least() -> None:
     """Pixels are alike about the crosses, which hides what is coarse of them."""
     rng = np.random.default_rng(2)

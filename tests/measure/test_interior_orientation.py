@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from adjust.functional_model.transformation import FILM_NAMES, HIGHEST_ORDER, film_parameter_names
 from measure import FiducialOptions, Scan, Status
+from measure.detection.correlation import GRAINY, WIDE, Surroundings
 from measure.detection.responses import ByteCache, Responses
 from measure.fiducials import consistency, measurement, stages
 from measure.fiducials import measure_frame as steps
@@ -374,6 +375,26 @@ def test_faint_marks_are_sought_again_only_where_predictions_moved(
     monkeypatch.setattr(steps, "orient_frame", lambda each: each)
     steps.detect_missing_marks(frame)
     assert len(rounds) == times
+
+
+@pytest.mark.parametrize("surroundings", [WIDE, GRAINY])
+def test_faint_marks_of_an_uncertain_frame_are_sought_nearer(
+    surroundings: Surroundings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In texture: what lies within 6 px, 0.3 mm of film, would become marks; 2.5 px do where marks are not certain."""
+    reached = list[float]()
+    frame = make_frame_chance(make_scan(picture(DOTS, "0")), DOTS)
+    frame = replace(frame, placement=replace(frame.placement, surroundings=surroundings))
+
+    def record(each: Frame, reach_px: float) -> Frame:
+        reached.append(reach_px)
+        return each
+
+    monkeypatch.setattr(steps, "MANY", 3)
+    monkeypatch.setattr(Frame, "is_certain_of_places", False)
+    monkeypatch.setattr(steps, "detect_faint_marks", record)
+    steps.detect_missing_marks(frame)
+    assert reached == [frame.gate_px if surroundings is WIDE else pytest.approx(2.5, abs=0.1)]
 
 
 def test_a_frame_moved_on_by_the_distance_of_two_marks_is_known_by_its_marks() -> None:

@@ -11,12 +11,12 @@ from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
 from measure import MarkMeasurement, Scan, Status, TargetOptions, TargetPrediction, measure_crosses, measure_disks
-from measure.flags import NO_REASON, Cause
+from measure.flags import NO_REASON, Cause, Code
 from measure.results import Covariance, SecondPlace
 from measure.targets.block_search import TargetCandidate
 from measure.targets.consistency import SheetImage, TargetPlaces, compare_targets, predict_sheet_points
 from measure.targets.detection import CrossSearch, DiskSearch, cross_candidates, disk_candidates
-from measure.targets.disks import FittedDisk, dust_reasons, fit_disk, fit_plain_disks
+from measure.targets.disks import FittedDisk, _assess, dust_reasons, fit_disk, fit_plain_disks
 from measure.targets.ring_codes import RingCode, read_code
 from measure.targets.sheets import Dots, Naming, SheetView, name_dots
 
@@ -640,6 +640,26 @@ def test_a_weak_disk_names_the_cause_of_its_standard_deviation() -> None:
     *reasons, weak = dust_reasons([*[make_disk()] * 8, make_disk(place_covariance=misfit)], [3 * np.eye(2)] * 9)
     assert weak == "its standard deviation is 0.65 px, the largest part from model misfit"
     assert not any(reasons)
+
+
+@pytest.mark.parametrize(("sigma", "is_white", "refused"), [(0.0, True, True), (0.2, True, False), (0.2, False, True)])
+def test_the_upper_bound_of_its_contrast_decides_on_a_faint_disk(sigma: float, is_white: bool, refused: bool) -> None:
+    """0.8 times the least signal-to-noise ratio of 4, by a contrast known to 20 %: 1.6 times as much in pure noise."""
+    unknowns, noise_dn = np.zeros((10, 10)), DUSTY_CONTRAST / (0.8 * 4.0)
+    unknowns[6, 6] = (sigma * DUSTY_CONTRAST) ** 2
+    disk = make_disk(noise_dn=noise_dn, covariance=unknowns, covariance_is_white=is_white)
+    assert (_assess(disk, np.zeros((2, 2))).reason.codes == (Code.CONTRAST,)) == refused
+
+
+def test_soft_disks_are_fitted_with_as_much_ground_as_their_blur_reaches() -> None:
+    """Radius 6 px, blur 3.5 px, noise of 4 % of the contrast. With 7 px of ground the mean error is 0.078 px."""
+    rng, errors = np.random.default_rng(3), []
+    for _ in range(10):
+        picture, place = GROUND + rng.normal(0, 800.0, (81, 81)), 40.0 + rng.uniform(-0.5, 0.5, 2)
+        shape = some_ellipse(rng, 6.0, 0.9)
+        picture += CONTRAST * draw(ellipse(place, shape), 81, 81, 3.5)
+        errors.append(np.hypot(*(fit_disk(make_scan(picture), place + rng.uniform(-1, 1, 2), shape).center_px - place)))
+    assert np.mean(errors) < 0.062
 
 
 def make_disk(shape: Array = UNIT_DISK_PX, **figures: Any) -> FittedDisk:
