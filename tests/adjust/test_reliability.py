@@ -521,7 +521,7 @@ def test_a_principal_distance_that_nearly_parallel_images_hardly_tell_is_named()
     assert warning.endswith("points at other heights; or give it with its standard deviation.")
     sound = adjust(board_network(0, EIGHT[:2]))
     assert not sound.warnings
-    assert (result.loose_cameras, sound.loose_cameras) == ({"cam"}, set())
+    assert (result.loose_cameras, sound.loose_cameras) == (frozenset({"cam"}), frozenset())
 
 
 @pytest.mark.parametrize(("direction", "where"), [((1.0, 0.5, 0.0), "on one line"), ((0.0, 0.0, 0.0), "at one place")])
