@@ -97,7 +97,7 @@ def recognise_frame(scan: Scan, layout: FiducialLayout, response: CameraResponse
             if not comb(len(peaks), len(false_alarms)) * false_alarms.prod() <= CAMERA_BY_NOISE:
                 continue
         # All marks count in the score: without the missing ones, a camera of eight loses to one that has four.
-        frame = detect_frame(scan, layout, enlarged, _QUICK_OPTIONS)
+        frame = detect_frame(scan, layout, enlarged, _QUICK_OPTIONS, is_quick=True)
         if frame.accepted:
             return frame
     return None

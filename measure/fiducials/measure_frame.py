@@ -387,13 +387,19 @@ def measure_frame(
 
 
 def detect_frame(
-    scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions, begun: Frame | None = None
+    scan: Scan,
+    layout: FiducialLayout,
+    placement: Placement,
+    options: FiducialOptions,
+    begun: Frame | None = None,
+    is_quick: bool = False,
 ) -> Frame:
-    """Detect the marks of a frame, clear and faint ones, without the refit. begun: as for `measure_frame`."""
+    """Detect the marks of a frame, clear and faint ones, without the refit. begun: as for `measure_frame`; is_quick:
+    without the width of lines and the sharpening, which take longer than the marks."""
     frame = begun or start_frame(scan, layout, placement, options)
     pending = [index for index, each in enumerate(frame.detections) if not (each.inside or each.reason)]
     clear = orient_frame(_detect(frame, pending, frame.first_search_px))
-    return detect_missing_marks(fit_lines_and_sharpening(clear, _FEWEST_SHARPENED))
+    return detect_missing_marks(clear if is_quick else fit_lines_and_sharpening(clear, _FEWEST_SHARPENED))
 
 
 def start_frame(scan: Scan, layout: FiducialLayout, placement: Placement, options: FiducialOptions) -> Frame:

@@ -106,10 +106,11 @@ def test_crosses_whose_lines_are_narrower_than_drawn_are_drawn_so_and_fitted() -
     grey = 30000 + np.random.default_rng(3).normal(0, 400.0, (size, size))
     for mark in shown.marks:
         draw.paint(grey, mark.mark, mark.xy_mm, matrix, -20000.0, 55, 0.1)
-    scan = draw.make_scan(grey)
-    frame = detect_frame(
-        scan.replace_tone(LINEAR), given, Placement("0", matrix, 1.0, 4, 1, 1, (0.05, 0.05)), FiducialOptions("0")
-    )
+    placement = Placement("0", matrix, 1.0, 4, 1, 1, (0.05, 0.05))
+    begun = draw.make_scan(grey).replace_tone(LINEAR), given, placement, FiducialOptions("0")
+    frame, quick = detect_frame(*begun), detect_frame(*begun, is_quick=True)
+    assert quick.layout is given
+    assert len(quick.inlier_fits) == 4
     drawn_mm = {round(mark.mark.thinnest_mm, 3) for mark in frame.layout.marks}
     assert len(drawn_mm) == 1
     assert min(drawn_mm) < 0.11
