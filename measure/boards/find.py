@@ -32,6 +32,7 @@ _SMOOTH = 4  # corners of a line through which the cubic is laid that predicts a
 _TRUSTED = 0.1  # in squares, largest deviation of any corner accepted from OpenCV's older detector
 _REFINED, _REFINING_END = 0.3, (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)  # in squares; px
 _INTO_SQUARE = 0.3  # in squares from the corner, where a square's grey value is sampled
+_NEAR, _LEAST_NEAR = 0.1, 0.05  # there a crossing keeps a ninth of the contrast under any blur, the gap of dots none
 _CROSSING = 0.25  # fraction of the board's contrast required between all neighbours of the four squares
 _SMOOTHED_PX = 10.0  # px, side from which on squares are sampled as means of 3 x 3 pixels
 _COVERED = 0.3  # fraction of a further line, at least one corner, that may be covered: a clipboard's clip resembles 2/3
@@ -101,7 +102,9 @@ def _from_neighbours(grid: Array) -> Array:
 
 
 def whole_pattern(picture: Bytes, grid: Array) -> WholePattern | None:
-    """Grow a grid to the complete pattern. None if a line of the grid is not mostly crossings."""
+    """Grow a grid to the complete pattern. None if a line of the grid is not mostly crossings, or if its squares do not
+    touch, as dots do not."""
+    near, far = (abs(float(np.median(_crossing_contrast(picture, grid, into)))) for into in (_NEAR, _INTO_SQUARE))
     if _shorter_steps(grid).min() > _SMOOTHED_PX:
         picture = np.asarray(cv2.blur(picture, (3, 3)), np.uint8)
     crossings = _crossing_contrast(picture, grid)
@@ -109,7 +112,11 @@ def whole_pattern(picture: Bytes, grid: Array) -> WholePattern | None:
     if contrast < 0:
         crossings, contrast = -crossings, -contrast
     is_crossing = crossings > _CROSSING * contrast
-    if not (contrast > 0 and all(2 * line.sum() >= len(line) for line in (*is_crossing, *is_crossing.T))):
+    if not (
+        contrast > 0
+        and near >= _LEAST_NEAR * far
+        and all(2 * line.sum() >= len(line) for line in (*is_crossing, *is_crossing.T))
+    ):
         return None
     has_ended = []
     for _ in range(4):
@@ -138,11 +145,11 @@ def _grown(picture: Bytes, grid: Array, contrast: float) -> tuple[Array, bool]:
         grid = further
 
 
-def _crossing_contrast(picture: Bytes, grid: Array) -> Array:
-    """(rows, columns) smallest difference in grey value between neighbours of the four squares around each corner, with
-    the sign relative to the first corner's parity; 0 where light and dark do not alternate."""
+def _crossing_contrast(picture: Bytes, grid: Array, into: float = _INTO_SQUARE) -> Array:
+    """(rows, columns) smallest difference in grey value between neighbours of the four squares around each corner, so
+    far into them, with the sign relative to the first corner's parity; 0 where light and dark do not alternate."""
     right, down = np.moveaxis(_grid_steps(grid), -1, 0)
-    corners = [grid + _INTO_SQUARE * (x * right + y * down) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    corners = [grid + into * (x * right + y * down) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     columns_rows = np.concatenate(corners).astype(np.float32)
     columns, rows = columns_rows[..., 0], columns_rows[..., 1]
     grey = cv2.remap(picture, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)

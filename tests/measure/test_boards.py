@@ -457,6 +457,14 @@ def test_an_asymmetric_grid_of_another_count_is_refused_with_its_own(columns: in
     assert {mark.status for mark in board.marks} == {Status.ABSENT}
 
 
+def test_dots_are_no_squares_of_a_chessboard() -> None:
+    """Halfway between 44 staggered dots lie 70 places about which light and dark alternate: they had been corners."""
+    grid = specs.CircleGridSpec(8, 11, 14.0, 13.0, asymmetric=True)
+    picture = draw.take_picture(grid, draw.board_from_pixel(8.0, 2e-4), draw.circles_dark(grid))
+    board = measure_board(draw.make_scan(picture), specs.ChessboardSpec(7, 10, 14.0))
+    assert {mark.status for mark in board.marks} == {Status.ABSENT}
+
+
 def test_a_few_spots_are_no_circle_grid() -> None:
     """Four of them make no lattice at all."""
     places = np.array([(40.0, 50.0), (90.0, 52.0), (150.0, 140.0), (260.0, 200.0), (300.0, 90.0)])
