@@ -56,12 +56,14 @@ class Surroundings:
         over adjacent marks and hide faint ones.
         """
         coarse_px = self.coarse * detail_px
-        detail = image - _median(image, coarse_px)
+        detail = _median(image, coarse_px)
+        np.subtract(image, detail, out=detail)  # in place, here and below: a map of a whole scan is large
+        del image
         if self.robust:
             variance = (SIGMA_OF_DEVIATION * _median(np.abs(detail), coarse_px)) ** 2
         else:
             variance = _smoothed(detail**2, 2 * coarse_px)
-        variance += faint_dn**2  # in place, here and below: a map of a whole scan is large
+        variance += faint_dn**2
         detail /= np.sqrt(variance, out=variance)
         return np.clip(detail, -_CLIP, _CLIP, out=detail)
 
