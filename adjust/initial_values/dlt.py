@@ -67,12 +67,25 @@ class LinearTransformations:
     @property
     def misfit(self) -> Array:
         """(m,) median residual in units of the image's extent."""
-        projected = self.field.places @ self.coefficients[..., :3].swapaxes(1, 2) + self.coefficients[:, None, :, 3]
-        depths = projected[..., 2:]
-        off = projected[..., :2] / np.where(np.abs(depths) < LEAST_DEPTH, LEAST_DEPTH, depths) - self.image.places
-        ordered = np.sort(np.where(self.present, np.linalg.norm(off, axis=2), np.inf), axis=1)
+        off = self._distances(self.field.places, self.image.places)
+        ordered = np.sort(np.where(self.present, off, np.inf), axis=1)
         counts = self.present.sum(axis=1)
         return np.asarray(ordered[np.arange(len(ordered)), [(counts - 1) // 2, counts // 2]].mean(axis=0))
+
+    def residuals(self, xyz: Array, xy_mm: Array) -> Array:
+        """(m, n) distances of points (m, n, 3) from their places (m, n, 2), in units of the image's extent."""
+        field, image = (
+            (each - own.origin[:, None]) / own.size[:, None, None]
+            for each, own in ((xyz, self.field), (xy_mm, self.image))
+        )
+        return self._distances(field, image)
+
+    def _distances(self, field: Array, image: Array) -> Array:
+        """(m, n) distances of normalised points from their normalised places."""
+        projected = field @ self.coefficients[..., :3].swapaxes(1, 2) + self.coefficients[:, None, :, 3]
+        depths = projected[..., 2:]
+        off = projected[..., :2] / np.where(np.abs(depths) < LEAST_DEPTH, LEAST_DEPTH, depths) - image
+        return np.asarray(np.linalg.norm(off, axis=2))
 
 
 def linear_transformations(xyz: Array, xy_mm: Array, present: Mask | None = None) -> LinearTransformations:

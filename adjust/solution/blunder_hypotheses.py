@@ -31,7 +31,7 @@ from adjust.solution.given_orientations import (
     wrong_orientations,
 )
 from adjust.solution.result import Adjustment
-from adjust.solution.wrong_names import LARGE, NAMED, transformed_fields
+from adjust.solution.wrong_names import LARGE, NAMED, points_with_scaled_heights, transformed_fields
 
 WORST, RARE = 3, 1e-3  # frames of a camera tried with another one; ratio of likelihoods to be exceeded by one trial
 MOST_PAIRS = 15  # pairs of frames tried as exchanged, largest residuals first
@@ -93,7 +93,8 @@ def network_hypotheses(network: Network, bare: Network, given: Adjustment | None
         yield [NetworkHypothesis(UNIT.format(times_too(factor)), _move_points(network, by), remedy, by)]
     is_far = given is None or not given.converged or given.sigma0 > ONE_AXIS
     exchanged, mirrored_images = _exchanged_frames(network, given), _mirrored_images(network)
-    heights = _one_axis(network, (2,)) if is_far else ()  # before distances, of which one may do the same
+    # Before distances, of which one may do the same.
+    heights = chain(_one_axis(network, (2,)), _some_heights(network)) if is_far else ()
     # With any units of the axes linear transformations of the given points fit all images, but the adjustment does not.
     large_mm = LARGE * np.ptp(network.observations.xy_mm)
     misses = given is None or not given.converged or np.sqrt(np.mean(given.residuals.v_mm**2)) > large_mm
@@ -112,8 +113,27 @@ def _one_axis(network: Network, axes: Sequence[int]) -> Iterator[NetworkHypothes
         yield NetworkHypothesis(words, _move_points(network, by), moved=by)
 
 
+def _some_heights(network: Network) -> Iterator[NetworkHypothesis]:
+    """Hypothesis: the heights of some points are in another unit than those of the others."""
+    for factor in FACTORS:
+        names, doubtful = points_with_scaled_heights(network, factor)
+        if not names:
+            continue
+        points = (replace(each, Z=_scaled(each.Z, factor)) if each.id in names else each for each in network.points)
+        points = (replace(each, Z=_loosened(each.Z)) if each.id in doubtful else each for each in points)
+        who = f"{len(names)} of {len(network.known_places)} points ({shortened(sorted(names), NAMED)})"
+        yield NetworkHypothesis(
+            f"Z of {who} is {times_too(factor)} for the others: another unit",
+            replace(network, points=tuple(points)),
+        )
+
+
 def _scaled(prior: Prior | None, factor: float) -> Prior | None:
     return prior and Prior(factor * prior.value, abs(factor) * prior.sigma)
+
+
+def _loosened(prior: Prior | None) -> Prior | None:
+    return prior and Prior(prior.value, np.inf)
 
 
 def _move_points(network: Network, by: Array) -> Network:

@@ -31,6 +31,7 @@ QUARTERS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))  # cosine and sine
 MOST_SHIFTED, FEWEST_SHIFTED = 3, 3  # rows by which a run of a table is shifted at most, and those of the shortest run
 BREAKS, RUN_IMAGES = 40, 4  # rows where runs are first tried to begin and end; images with most points that show them
 AS_GOOD = 2.0  # ratio of the squares of misfits up to which runs are alike: a wrong row multiplies them
+FEW_HEIGHTS, DRAWS = 7, 4  # points of an image all combinations of whose heights are tried, and how often
 FEWEST_FIDUCIALS = 4  # of a frame, that tell by an affine transformation which are exchanged
 # Scan orientations: turned by quarters, and mirrored; the unmirrored ones first.
 TURNS = [flip @ np.array([[c, -s], [s, c]]) for flip in (np.eye(2), np.diag([-1.0, 1.0])) for c, s in QUARTERS]
@@ -252,6 +253,56 @@ def transformed_fields(network: Network) -> list[TransformedField]:
         columns = [network.images[image] for image in images], some, fits.misfit.tolist(), fits.handedness.tolist()
         found |= zip(images.tolist(), map(TransformedField._make, zip(*columns, strict=True)), strict=True)
     return [found[image] for image in sorted(found)]
+
+
+def points_with_scaled_heights(network: Network, factor: float) -> tuple[set[str], set[str]]:
+    """Names of the given points whose heights times a factor let linear transformations fit far better, and of those
+    whose heights this hardly changes; none where all or none would be such."""
+    names: dict[str, float] = {}
+    fields = transformed_fields(network)
+    if not fields or MUCH_BETTER * max(each.misfit for each in fields) < LARGE:
+        return set(), set()
+    for field in sorted(fields, key=lambda each: -len(each.rows)):
+        shown = [network.observations.point[row] for row in field.rows]
+        if names.keys() >= set(shown):
+            continue
+        xyz, xy_mm = np.array([network.known_places[name] for name in shown]), network.observations.xy_mm[field.rows]
+        ratios, times = _scaled_heights(xyz, xy_mm, factor)
+        if times < BETTER:
+            return set(), set()
+        names |= dict(zip(shown, ratios.tolist(), strict=True))
+    scaled = {name for name, ratio in names.items() if ratio > BETTER}
+    doubtful = {name for name, ratio in names.items() if 1.0 / BETTER <= ratio <= BETTER}
+    return (scaled, doubtful) if len(scaled) + len(doubtful) < len(names) else (set(), set())
+
+
+def _scaled_heights(xyz: Array, xy_mm: Array, factor: float) -> tuple[Array, float]:
+    """Ratios (n,) of the residuals of points (n, 3) without and with scaled heights, and that of the misfits.
+
+    All combinations are tried on a few points; the transformation of the best tells those of all others.
+    """
+    generator = np.random.default_rng(0)
+    combinations_of_few = np.array(list(product((False, True), repeat=FEW_HEIGHTS)))
+    both = np.stack([xyz, xyz * (1.0, 1.0, factor)])
+    best = np.inf, np.ones(len(xyz))
+    shared = np.broadcast_to(xy_mm, (len(combinations_of_few), *xy_mm.shape))
+    for _ in range(DRAWS):
+        few = generator.permutation(len(xyz))[:FEW_HEIGHTS]
+        masks = np.zeros((len(combinations_of_few), len(xyz)), dtype=bool)
+        masks[:, few] = combinations_of_few
+        present = np.zeros_like(masks)
+        present[:, few] = True
+        for _ in range(2):
+            fits = linear_transformations(np.where(masks[..., None], both[1], both[0]), shared, present)
+            off = np.stack([fits.residuals(np.broadcast_to(each, (len(masks), *xyz.shape)), shared) for each in both])
+            masks, present = off[1] < off[0], np.ones_like(present)
+        misfits = np.sqrt(np.mean(off.min(axis=0) ** 2, axis=1))
+        if misfits.min() < best[0]:
+            own = off[:, int(np.argmin(misfits))]
+            best = float(misfits.min()), own[0] / np.maximum(own[1], 1e-300)
+    given = linear_transformations(xyz[None], xy_mm[None])
+    as_given = float(np.sqrt(np.mean(given.residuals(xyz[None], xy_mm[None]) ** 2)))
+    return best[1], as_given / best[0]
 
 
 def _natural(name: str) -> list[tuple[int, str]]:

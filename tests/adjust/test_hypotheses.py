@@ -18,10 +18,12 @@ from adjust.functional_model.rotation import rotation_from_angles
 from adjust.problem.problem import number_reduced
 from adjust.quality.critical_values import Probabilities
 from adjust.solution.adjustment import _is_of_single_marks, _Solver, adjust_unmodelled
+from adjust.solution.blunder_hypotheses import network_hypotheses
 from adjust.solution.explanations import explain
 from adjust.solution.frame_hypotheses import frame_cause
 from adjust.solution.model_hypotheses import film_deformations, model_hypotheses
 from adjust.solution.result import adjust_problem
+from adjust.solution.wrong_names import points_with_scaled_heights
 
 QUICK = (
     "lens: no radial term",
@@ -1076,3 +1078,53 @@ def test_principal_points_of_the_images_own_are_named(seed: int) -> None:
     assert (result.suspects, result.warnings) == ((), ())
     (first, last), true_mm = map(int, images), off_mm[:, "xy".index(axis)]
     assert abs(float(by) - (true_mm[last] - true_mm[first])) < 4.0 * float(sigma)
+
+
+FIELDS: list[Callable[[int], Network]] = [
+    faults.blunder_network,
+    lambda seed: faults.misfit_network(
+        faults.scene(seed, flat=False), faults.Effects(), SOUND, np.random.default_rng(seed)
+    ),
+]
+
+
+def _in_feet(given: Network, every: int) -> tuple[Network, list[str]]:
+    """With the heights of every second point, or fourth, say, in feet, and the names of these."""
+    points = [
+        replace(point, Z=Prior(3.2808 * point.Z.value, point.Z.sigma)) if k % every == 0 and point.Z else point
+        for k, point in enumerate(given.points)
+    ]
+    return replace(given, points=tuple(points)), [point.id for point in given.points[::every]]
+
+
+@pytest.mark.parametrize("network", FIELDS, ids=["film", "digital"])
+@pytest.mark.parametrize("every", [2, 4])
+def test_heights_of_some_points_in_feet_are_found_by_linear_transformations(
+    network: Callable[[int], Network], every: int
+) -> None:
+    """The iteration diverged, and wrong point numbers were to be looked for."""
+    spoilt, names = _in_feet(network(3), every)
+    scaled, doubtful = points_with_scaled_heights(spoilt, 1.0 / 3.2808)
+    assert scaled == set(names) - doubtful
+    assert len(doubtful) < 0.2 * len(spoilt.points)
+    assert points_with_scaled_heights(network(3), 1.0 / 3.2808) == (set(), set())
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("seed", [1, 3, 5])
+@pytest.mark.parametrize("network", FIELDS, ids=["film", "digital"])
+@pytest.mark.parametrize("every", [2, 4])
+def test_heights_of_some_points_in_feet_are_named(network: Callable[[int], Network], every: int, seed: int) -> None:
+    spoilt, names = _in_feet(network(seed), every)
+    who = rf"({len(names)}|{len(names) - 1}) of {len(spoilt.points)} points \(.*\)"
+    with pytest.raises(AdjustmentError, match=rf"^Z of {who} is 3\.281 times too large for the others: another unit"):
+        adjust(spoilt)
+
+
+def test_heights_of_some_points_in_another_unit_are_a_hypothesis_on_the_network() -> None:
+    spoilt, _ = _in_feet(faults.blunder_network(11), 2)
+    solver = _Solver(Options())
+    hypotheses = (each for each, *_ in network_hypotheses(spoilt, spoilt, None))
+    found = next(each for each in hypotheses if " for the others" in each.words)
+    assert solver.trials.explains(solver.trials.adjust(found.network))
+    assert found.words.startswith("Z of 8 of 16 points (0, 10, 12, 14, 2 and 3 more) is 3.281 times too large")
