@@ -36,12 +36,17 @@ class _Normalised:
         is_there = present[..., None]
         origin = (places * is_there).sum(axis=1) / present.sum(axis=1)[:, None]
         centred = (places - origin[:, None]) * is_there
-        largest = np.maximum(np.abs(centred).max(axis=(1, 2)), 1e-300)  # for the squares
+        largest = _size_or_one(np.abs(centred).max(axis=(1, 2)))  # for the squares
         centred /= largest[:, None, None]
         squares, axes = np.linalg.eigh(centred.swapaxes(1, 2) @ centred)
         extents = np.sqrt(np.maximum(squares[:, ::-1], 0.0))
-        size = np.maximum(extents[:, 0], 1e-300)
+        size = _size_or_one(extents[:, 0])
         return cls(centred / size[:, None, None], origin, largest * size, extents, axes[..., ::-1])
+
+
+def _size_or_one(size: Array) -> Array:
+    """Sizes (m,), 1 where all points lie at one place."""
+    return np.where(size > 0.0, size, 1.0)
 
 
 @dataclass(frozen=True)

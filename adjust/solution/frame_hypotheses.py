@@ -53,7 +53,7 @@ def _frame_hypotheses(network: Network, frame: str, rest: Adjustment) -> Iterato
     for kind in RICHER.get(image.transformation, ()):
         images = tuple(replace(each, transformation=kind) if each is image else each for each in network.images)
         yield (
-            f"the film of image {frame} is deformed by more than its transformation ({image.transformation}) takes up; "
+            f"the film of image {frame} is deformed by more than its transformation ({image.transformation}) models; "
             f"with {kind} all agree. Look for stretched or torn film, and scan it again.",
             replace(network, images=images),
         )

@@ -413,7 +413,7 @@ def _jumps(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
 
 
 def film_deformations(run: Run) -> Iterator[ModelHypothesis]:
-    """Films that are deformed, each in its own way, by more than their transformation takes up, and one such film."""
+    """Films that are deformed, each in its own way, by more than their transformation models, and one such film."""
     network, problem = run.problem.network, run.problem
     given = {image.transformation for image in network.images} - {"none"}
     films = [image.name for image in network.images if image.transformation in given]
@@ -444,7 +444,7 @@ def _film_words(given: Transformation, kind: Transformation, found: Estimate) ->
 
 def _single_film_words(image: str, given: Transformation, _: Estimate) -> tuple[str, str]:
     return (
-        f"The film of image {image} is deformed by more than its transformation ({given}) takes up, unlike the others",
+        f"Only the film of image {image} is deformed by more than its transformation ({given}) models",
         "Look for stretched or torn film, or a frame of another camera, and scan it again or leave it out.",
     )
 

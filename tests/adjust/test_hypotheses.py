@@ -982,7 +982,9 @@ def test_one_film_that_is_deformed_otherwise_is_named_alone() -> None:
     """All films had been called deformed."""
     result = adjust(_bent(faults.blunder_network(0), "f2", 3e-4))
     (found,) = result.explanations
-    assert found.cause.startswith("The film of image f2 is deformed by more than its transformation (affine) takes up")
+    assert found.cause.startswith(
+        "Only the film of image f2 is deformed by more than its transformation (affine) models"
+    )
     assert (result.suspects, result.left_out) == ((), {})
 
 

@@ -254,7 +254,7 @@ def test_unlike_dark_marks_of_a_colour_scan_keep_one_map_each() -> None:
     responses = correlate_scan(make_scan(grey), views, {-1}, CLOSE, cache, 1000, 4)
     for kind, place in zip(responses.kinds, places, strict=True):
         map_ = responses.maps[kind, -1]
-        assert np.unravel_index(map_.argmax(), map_.shape)[::-1] == place
+        assert np.array_equal(np.unravel_index(map_.argmax(), map_.shape)[::-1], place)
         assert map_.max() > 0.6
     assert sum(each.nbytes for each in cache._entries.values()) == 2 * 4 * 110 * 130
 
