@@ -240,8 +240,13 @@ class CameraIntrinsics:
                 f"Standard deviations of {', '.join(larger)}: by leaving out one picture at a time, up to {most:.1f} "
                 "times those of a model with independent errors."
             )
-        elif any(each.sigma_clusters is None for each in self.values.values()):
-            yield "Too few pictures to see whether errors within a picture are correlated: real errors may be larger."
+        # Left out one at a time, fewer pictures than parameters vary the camera in some directions only.
+        estimated = sum(each.sigma > 0.0 for each in self.values.values())
+        if self.used <= estimated or any(each.sigma_clusters is None for each in self.values.values()):
+            yield (
+                f"{self.used} pictures are few for the {estimated} parameters of the camera: errors within a picture "
+                "may be correlated unnoticed, and real errors larger."
+            )
         if self.correlations:
             pairs = ", ".join(f"{a} and {b} {value:.2f}" for a, b, value in self.correlations)
             yield f"Correlations above {HIGHLY_CORRELATED}: {pairs}."

@@ -250,6 +250,15 @@ def test_the_chosen_lens_is_printed(result: dict[str, Any], calibrations: list[C
     assert line.endswith("rms 0.158 px in pictures left out (opencv4 0.162 px, fisheye no solution).")
 
 
+@pytest.mark.parametrize("used", [8, 9])
+def test_no_more_pictures_than_parameters_are_told(used: int, calibrations: list[CalibrationResult]) -> None:
+    """fx, fy, cx, cy, k1, k2, p1 and p2."""
+    (camera,) = calibrations[0].cameras
+    text = io.StringIO()
+    replace(camera, used=used).print(Console(file=text, width=200))
+    assert ("8 pictures are few for the 8 parameters of the camera" in text.getvalue()) == (used == 8)
+
+
 def test_a_calibration_is_plotted_and_shown_in_a_notebook(
     result: dict[str, Any], calibrations: list[CalibrationResult], monkeypatch: pytest.MonkeyPatch
 ) -> None:
