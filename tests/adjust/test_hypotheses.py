@@ -96,7 +96,7 @@ def test_a_large_bow_is_found_where_it_leads() -> None:
     assert abs(float(value)) < 3.0 * float(sigma)
 
 
-@parametrize_with_studies("off_mm", [0.3, 2.0, 0.1])
+@parametrize_with_studies("off_mm", [0.1, 0.3, 2.0])
 @parametrize_with_studies("b1", [0.0, 0.003], quick=(0, 1))
 def test_one_wrong_mark_is_named_alone_and_with_pixels_that_are_not_square(off_mm: float, b1: float) -> None:
     """All marks of its image had been left out, or the images had been distorted each in its own way."""
@@ -187,7 +187,7 @@ def test_an_estimated_noise_does_not_hide_two_cameras_in_one(seed: int) -> None:
 FITTED = replace(SOUND, sigma=0.1)  # standard deviations given ten times too small
 
 
-@parametrize_with_studies("seed", [3, 5, 6, 7])
+@parametrize_with_studies("seed", [6, 3, 5, 7])
 @parametrize_with_studies("noise", [1.0, 10.0], quick=(1,))
 def test_each_image_with_a_principal_distance_of_its_own_is_no_two_groups(seed: int, noise: float) -> None:
     made, rng = faults.scene(seed, flat=True), np.random.default_rng(seed)
