@@ -300,7 +300,7 @@ def test_learned_marks_are_cut_in_the_measured_channels() -> None:
 
 
 PLACES = {f"{x}{y}": (106.0 * x, 106.0 * y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y}
-RADIUS_MM, OBLIQUE_FILM_PITCH_UM, FRAME_MM = 1.5, 200.0, (228.0, 228.0)
+RADIUS_MM, OBLIQUE_FILM_PITCH_UM, FRAME_MM = 1.5, 250.0, (228.0, 228.0)
 
 
 EIGHT, COLUMNS, ROWS = (
