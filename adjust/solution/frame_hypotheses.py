@@ -58,14 +58,14 @@ def _frame_hypotheses(network: Network, frame: str, rest: Adjustment) -> Iterato
             replace(network, images=images),
         )
 
-    def found(quantity: str, sigma: float = 0.0) -> Prior:
+    def estimated(quantity: str, sigma: float = 0.0) -> Prior:
         return Prior(rest.value(Parameter.interior(camera.name, quantity)), sigma)
 
-    lens = replace(camera.distortion, parameters={name: found(name) for name in camera.distortion.parameters})
+    lens = replace(camera.distortion, parameters={name: estimated(name) for name in camera.distortion.parameters})
     other = replace(
         camera,
         name=f"{camera.name}{OTHERS}",
-        principal_distance_mm=found("c", np.inf),
+        principal_distance_mm=estimated("c", np.inf),
         x0_mm=None,
         y0_mm=None,
         distortion=lens,

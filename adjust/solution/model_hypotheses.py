@@ -193,7 +193,7 @@ def _lens_terms(run: Run, camera: Camera) -> Iterator[ModelHypothesis]:
 def _held_terms(camera: Camera, group: str, free: Collection[str]) -> list[str]:
     """Terms of a group of the camera's distortion family that are not free."""
     lens_family = family(camera.distortion.family)
-    # Terms of a denominator are asked for by nobody at first.
+    # Terms of a denominator have the same derivatives at 0 as others: they are freed last, by hand.
     return [
         name
         for name in dict(lens_family.groups).get(group, ())

@@ -263,7 +263,7 @@ def _find_in_stages(
     while pending:
         stage = pending.pop(0)
         if stage.kind == "turned":
-            found = _in_other_orientations(scan, layout, options, found)
+            found = _try_other_orientations(scan, layout, options, found)
             continue
         if stage.is_unnecessary(found):
             continue
@@ -308,7 +308,7 @@ def _find_in_stages(
     return StageResult(misfit=found.misfit.reword(found.misfit + _what_to_do(found)))
 
 
-def _in_other_orientations(
+def _try_other_orientations(
     scan: Scan, layout: FiducialLayout, options: FiducialOptions, found: StageResult
 ) -> StageResult:
     """Measure a frame that is not sure, but has a clear mark, in other orientations that score as well at its place."""
@@ -317,12 +317,12 @@ def _in_other_orientations(
         return found
     best = frame.placement if found.is_taken else found.result.placements[0]
     start = frame.scan if found.is_taken else scan
-    turned = (measure_frame(start, layout, each, options) for each in _orientations_at(found.result, best, frame))
+    turned = (measure_frame(start, layout, each, options) for each in _rival_orientations(found.result, best, frame))
     most = max((frame, *turned), key=_match)
     return replace(found, frame=most, is_taken=True) if most.accepted and most is not frame else found
 
 
-def _orientations_at(result: SearchResult, best: Placement, frame: Frame) -> list[Placement]:
+def _rival_orientations(result: SearchResult, best: Placement, frame: Frame) -> list[Placement]:
     """Placements at the place of the best one in orientations with other pictures that score as well."""
     marks, search = frame.layout.marks, result.searches[best.pitch_mm]
     scan_from_up = np.diag((1.0, -1.0) / np.asarray(best.pitch_mm))

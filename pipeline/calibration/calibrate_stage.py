@@ -55,7 +55,7 @@ from pipeline.workers import WorkOptions
 
 GENEROUS = 2.0  # factor on the unmodelled standard deviation, for lens models with larger misfit than the first
 FEWEST_CORNERS = 4  # corners for a space resection with redundancy
-MOST_LOOKED_AT = 6  # pictures in which a board that was not found is recognised: the first ones may not show it
+MOST_RECOGNISED = 6  # pictures in which a board that was not found is recognised: the first ones may not show it
 
 MOST_PARTITIONS, DIFFERENT = 3, 1e-4  # of images by their names that are tried; p-value of one camera
 
@@ -323,7 +323,7 @@ def _nothing(
     number = sum(len(camera.images) for camera in pictures.cameras)
     if len(left_out) == number:
         found, shown = f"the board was found in none of {counted(number, 'picture')}", ""
-        for name in pictures.cameras[0].images[:MOST_LOOKED_AT]:
+        for name in pictures.cameras[0].images[:MOST_RECOGNISED]:
             with suppress(MeasurementError), open_scan(pictures.files[name]) as scan:
                 if options := board.differing_options(fitting_board(scan, board.spec)):
                     return f"{found}: the markers of {name} lie as with {options}. Give that if it is the board's."

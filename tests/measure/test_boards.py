@@ -18,6 +18,7 @@ from measure import Status, open_scan
 from measure.boards import find, specs
 from measure.boards.edge_curvature import edge_curvatures
 from measure.boards.find import is_even, recognise_board, whole_pattern
+from measure.boards.lattice import grid_of_any_count
 from measure.boards.markers import ReadMarkers, charuco_board, find_aruco, find_charuco, off_corners
 from measure.boards.measure import BoardMeasurement, measure_board, one_definition
 from measure.flags import Cause, Code
@@ -840,3 +841,15 @@ def test_markers_of_two_boards_are_not_those_of_one(gap: float) -> None:
     board = measure_board(draw.make_scan(8000 + 120 * cv2.GaussianBlur(picture, (0, 0), 0.8) + noise), spec)
     assert "do not agree on where the board lies" in board.reason
     assert all(mark.status is Status.ABSENT for mark in board.marks)
+
+
+def test_a_part_of_a_grid_of_dots_has_no_count() -> None:
+    """5 x 5 dots alone are a whole grid; rows and columns of three that go on from them show that it is larger."""
+    places = [
+        (i, j) for i in range(-6, 7) for j in range(-6, 7) if min(abs(i), abs(j)) <= 1 or max(abs(i), abs(j)) <= 2
+    ]
+    middle = [place for place in places if max(map(abs, place)) <= 2]
+    counts = [
+        grid_of_any_count(30.0 * np.array(some, float) + 300.0, np.zeros((len(some), 3))) for some in (middle, places)
+    ]
+    assert counts == [(5, 5, False), None]

@@ -251,7 +251,7 @@ def test_the_chosen_lens_is_printed(result: dict[str, Any], calibrations: list[C
 
 
 @pytest.mark.parametrize("used", [8, 9])
-def test_no_more_pictures_than_parameters_are_told(used: int, calibrations: list[CalibrationResult]) -> None:
+def test_too_few_pictures_for_the_parameters_are_named(used: int, calibrations: list[CalibrationResult]) -> None:
     """fx, fy, cx, cy, k1, k2, p1 and p2."""
     (camera,) = calibrations[0].cameras
     text = io.StringIO()
@@ -469,7 +469,7 @@ def test_what_is_wrong_with_pictures_is_given_in_pixels(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("apart_px", [0.0, 12.0])
-def test_pictures_of_two_cameras_are_told_apart_by_their_names(
+def test_pictures_of_two_cameras_are_distinguished_by_their_names(
     apart_px: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They had been called distorted each in its own way. The second camera's principal point lies 12 px to the left;
@@ -488,10 +488,10 @@ def test_pictures_of_two_cameras_are_told_apart_by_their_names(
     written = calibrate_stage._CalibrationProject(
         BoardPictureFiles(files, (camera,), {}), tmp_path, CalibrationOptions(CHESSBOARD), {"camera": "opencv4"}
     )
-    said = written.cameras_by_name(camera, both)
-    assert bool(said) == bool(apart_px)
+    sentence = written.cameras_by_name(camera, both)
+    assert bool(sentence) == bool(apart_px)
     assert not written.cameras_by_name(camera, [mark for mark in both if mark.point < "r1"])  # lines give no solution
-    assert not said or re.search(r"\*leftp\*: .* cx 20[23]\.\d.*\*rightp\*: .* cx 19[01]\.\d", said)
+    assert not sentence or re.search(r"\*leftp\*: .* cx 20[23]\.\d.*\*rightp\*: .* cx 19[01]\.\d", sentence)
 
 
 def test_pictures_of_kinds_that_are_not_read_are_named(tmp_path: Path) -> None:

@@ -208,7 +208,7 @@ def test_stale_results_are_listed_and_not_shown(project: Path, change: Spoil, wo
     assert {name for name in ("adjustment", "check") if own_summary[name] is not None} == kept
 
 
-def test_what_is_not_of_the_present_scans_and_decisions_is_not_handed_on(
+def test_marks_of_replaced_scans_and_earlier_decisions_are_not_exported(
     project: Path, tmp_path: Path, refusal: Refusal
 ) -> None:
     """A rectified frame would show a new picture as the earlier one lay."""
