@@ -481,7 +481,7 @@ def test_a_frame_is_measured_in_the_orientations_that_score_as_well(
     if not uneven_mm:
         monkeypatch.setattr(Frame, "is_sure", False)
         monkeypatch.setattr(stages, "measure_frame", lambda *_: pytest.fail("it is measured again"))
-    taken = stages._in_other_orientations(scan, layout, OPTIONS, found)
+    taken = stages._try_other_orientations(scan, layout, OPTIONS, found)
     assert taken.is_taken == bool(uneven_mm)
     assert taken.frame is not None
     places_px = {index: fit.center_px for index, fit in taken.frame.inlier_fits.items()}
