@@ -20,7 +20,13 @@ from adjust.functional_model.rotation import angles_from_rotation, angles_near, 
 from adjust.functional_model.transformation import LATTICE, film_kind, fit_transformation
 from adjust.initial_values.model_formation import BlockState, extend, intersect_points, known_field, orient_free_model
 from adjust.initial_values.pose import KnownField, Pose, Sight, image_distances
-from adjust.initial_values.resection import FEWEST, find_principal_distance, find_wide_distance, resect_images
+from adjust.initial_values.resection import (
+    FEWEST,
+    find_interior_orientation,
+    find_principal_distance,
+    find_wide_distance,
+    resect_images,
+)
 from adjust.problem.camera import Camera
 from adjust.problem.network import Approximations, Exterior, Image, Network
 from adjust.problem.observations import Observations
@@ -209,6 +215,11 @@ def _interior(camera: Camera, frames: Frames, resected: dict[str, Pose]) -> Arra
         found = find_wide_distance(fields, camera.distortion)
     if found is None and given is not None:
         found = given.value
+    if found is None and all(prior is None or np.isinf(prior.sigma) for prior in (camera.x0_mm, camera.y0_mm)):
+        # Far off the middle of the picture, the principal point has to be found together with it.
+        together = find_interior_orientation(fields) if is_pinhole else None
+        if together is not None:
+            return np.array([0.0, x0, y0]) + together
     if found is None:
         why = _why_no_distance(fields)
         raise AdjustmentError(f"the principal distance of camera {camera.name} cannot be found from its images: {why}")

@@ -185,3 +185,41 @@ def closed_form(given: LinearTransformations) -> tuple[float, Array, Array] | No
     rotations = left @ right
     shifts = camera[..., 3] * (field.size / singular[:, :2].mean(axis=1))[:, None]
     return c, rotations, shifts - (rotations @ field.origin[..., None])[..., 0]
+
+
+def interior_orientation(given: LinearTransformations) -> Array | None:
+    """Principal distance and principal point (3,) in mm of one camera without distortion; None if not determined.
+
+    Notes
+    -----
+    Images a, b of orthogonal axes of equal length have a' W b = 0 and a' W a = b' W b, with W = (K K')⁻¹ the image of
+    the absolute conic (Hartley and Zisserman, section 8.8): two axes of a flat field, three of another one.
+    """
+    field, image = given.field, given.image
+    extent = float(image.size.mean())
+    projection = given.coefficients.copy()
+    projection[:, :2] *= image.size[:, None, None] / extent
+    projection[:, :2] += image.origin[..., None] / extent * projection[:, 2:]
+    imaged = projection[..., :3] @ field.axes
+    imaged /= np.linalg.norm(imaged, axis=(1, 2), keepdims=True)
+
+    def products(i: int, j: int) -> Array:
+        """(m, 4) products of two axes' images by the elements of W: 1, -x0, -y0, c² + x0² + y0²."""
+        a, b = imaged[..., i].T, imaged[..., j].T
+        return np.stack(
+            [a[0] * b[0] + a[1] * b[1], a[0] * b[2] + a[2] * b[0], a[1] * b[2] + a[2] * b[1], a[2] * b[2]], 1
+        )
+
+    lengths = [products(i, i) for i in range(3)]
+    deep = [products(0, 2), products(1, 2), (lengths[1] - lengths[2]) / 2.0]
+    equations = [products(0, 1), (lengths[0] - lengths[1]) / 2.0, *(each[~given.is_flat] for each in deep)]
+    rows = np.concatenate(equations)
+    if len(rows) < 4:
+        return None
+    _, singular, right = np.linalg.svd(rows)
+    noise = singular[3] / np.sqrt(len(rows) - 3) + SINGULAR
+    if not abs(right[3, 0]) > CLEAR * noise * np.linalg.norm(right[:3, 0] / (singular[:3] + SINGULAR)):
+        return None
+    x0, y0, square = right[3, 1:] / right[3, 0] * [-1.0, -1.0, 1.0]
+    square -= x0**2 + y0**2
+    return extent * np.array([np.sqrt(square), x0, y0]) if square > 0.0 else None

@@ -20,7 +20,7 @@ import numpy as np
 from adjust.array_types import Array, Indices, Mask
 from adjust.functional_model.lens import Distortion, Lens
 from adjust.functional_model.projection import rays
-from adjust.initial_values.dlt import closed_form, linear_transformations
+from adjust.initial_values.dlt import closed_form, interior_orientation, linear_transformations
 from adjust.initial_values.pose import (
     KnownField,
     Pose,
@@ -45,6 +45,7 @@ SOUND = 0.95  # least share of inliers without gross errors
 REWEIGHTINGS = 2  # largest number of estimates of a principal distance, each from the inliers of the one before
 GRID = np.geomspace(0.35, 16.0, 9)  # principal distances tried, in radii of the imaged field: 140 to 7 degrees
 FEWEST = 4  # known points of an image
+FEWEST_LINEAR = 6  # known points of an image that determine its linear transformation
 FEWEST_DIRECT = 3  # images that determine a principal distance by linear transformations
 COARSE_IMAGES, COARSE_POINTS = 4, 15  # images and points of each that choose a principal distance
 FINE_IMAGES = 50  # images that refine it
@@ -449,6 +450,15 @@ def find_principal_distance(fields: Sequence[KnownField]) -> tuple[float | None,
     resected = [(field, each) for field, each in zip(fields, found, strict=True) if each is not None]
     poses = {field: each.pose for field, each in resected if each.sigma_mm <= IMPLAUSIBLE * c}
     return c if sigma < LARGEST_RELATIVE_SIGMA else None, poses
+
+
+def find_interior_orientation(fields: Sequence[KnownField]) -> Array | None:
+    """Estimate principal distance and principal point (3,) of a pinhole camera, in mm, from linear transformations."""
+    fields = _largest_fields(fields, FEWEST_LINEAR, FINE_IMAGES)
+    if not fields:
+        return None
+    batch = _Fields.from_fields(fields, np.ones(len(fields)))
+    return interior_orientation(linear_transformations(batch.points, batch.tangents, batch.present))
 
 
 def find_wide_distance(fields: Sequence[KnownField], distortion: Distortion) -> float | None:

@@ -183,10 +183,10 @@ def _repeated_images(run: Run) -> Iterator[str]:
     point = np.array(observations.point)
     images = [(name, rows[np.argsort(point[rows], kind="stable")]) for name, rows in _rows_by_image(problem)]
     # The median of the squares of a bivariate normal distribution is 2 ln 2; gross errors hardly raise it.
-    marks = np.flatnonzero(run.weighting.used[: len(observations)]) if run.converged else np.empty(0, dtype=np.intp)
-    squares = (run.misfits.residual[marks] ** 2).sum(axis=1)
-    share = run.redundancies[marks].mean() if len(marks) else 0.0
-    variance = float(np.median(squares)) / (2.0 * np.log(2.0) * share) if share > UNCHECKED else 1.0
+    variance = 1.0
+    if run.converged and len(marks := np.flatnonzero(run.weighting.used[: len(observations)])):
+        squares, share = (run.misfits.residual[marks] ** 2).sum(axis=1), run.redundancies[marks].mean()
+        variance = float(np.median(squares)) / (2.0 * np.log(2.0) * share) if share > UNCHECKED else 1.0
     covariance = observations.covariance_mm2 * variance
     middles = np.array([observations.xy_mm[rows].mean(axis=0) for _, rows in images])
     reach = 2.0 * float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).max(initial=0.0)))

@@ -107,6 +107,42 @@ def test_a_plane_parallel_to_the_images_does_not_tell_the_principal_distance() -
     assert resection.find_principal_distance(given)[0] is None
 
 
+@pytest.mark.parametrize(("relief", "images"), [(0.3, 1), (0.3, 3), (0.0, 4)])
+def test_a_principal_point_far_outside_the_picture_is_found_with_the_principal_distance(
+    relief: float, images: int
+) -> None:
+    given, _ = known_fields([30] * images, relief, 0.7, SIGMA_MM)
+    middle_mm = np.array([-370.0, 190.0])  # of the picture, from the principal point
+    shifted = [replace(field, xy_mm=field.xy_mm - middle_mm) for field in given]
+    found = resection.find_interior_orientation(shifted)
+    assert found is not None
+    np.testing.assert_allclose(found, [C_MM, *-middle_mm], atol=0.5)
+    parallel, _ = known_fields([30] * images, 0.0, 0.0, SIGMA_MM)
+    assert resection.find_interior_orientation(parallel) is None
+
+
+def test_one_picture_far_off_the_axis_calibrates_its_camera() -> None:
+    xyz, xy, _ = simulated_poses(30, 0.4, 0.3, np.random.default_rng(2), SIGMA_MM)
+    network = nets.project_field(xyz - ORIGIN, nets.CONVERGENT_STATIONS[:1], kind="none").network
+    assert len(network.observations) == len(xyz)
+    shifted = replace(network.observations, xy_mm=xy + np.array([-370.0, 190.0]))
+    network = nets.set_camera(network, principal_distance_mm=None, x0_mm=None, y0_mm=None)
+    network = replace(network, observations=shifted)
+    result = adjust(network, approximate(network))
+    values = [result.value(f"IO.rc20.{name}") for name in ("c", "x0", "y0")]
+    np.testing.assert_allclose(values, [C_MM, -370.0, 190.0], atol=0.1)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_camera_of_one_image_with_four_points_is_singular(seed: int) -> None:
+    xyz = np.random.default_rng(seed).uniform(-1.0, 1.0, (4, 3)) * [700.0, 700.0, 300.0]
+    network = nets.project_field(xyz, nets.CONVERGENT_STATIONS[1:2], kind="none").network
+    network = nets.set_camera(network, principal_distance_mm=None, x0_mm=None, y0_mm=None)
+    result = adjust(network, approximate(network))
+    assert result.singular
+    assert result.warnings == ()
+
+
 def model_in_space(rng: np.random.Generator) -> tuple[Array, Array, Array, Array]:
     """Model points and stations, and the same in the object space, the cameras above."""
     points = rng.uniform(-1.0, 1.0, (12, 3)) * [900.0, 900.0, 200.0] + [5e4, 2e4, 300.0]
