@@ -110,7 +110,7 @@ def placed_markers(read: MarkerReadings, board: Markers) -> ReadMarkers:
     """Select the markers consistent with a board, in the order in which they were read."""
     readings = {number: places for number, places in read.outlines_px.items() if number in board}
     view = _view(readings, board, read.size_px, read.border / 2)
-    fitting_side = _fitting_side(readings, board, read.size_px) if view is None else None
+    own_side = fitting_side(readings, board, read.size_px) if view is None else None
     corners: dict[int, Array] = {}
     several = {number: len(places) for number, places in readings.items() if len(places) > 1}
     refused: dict[int, Reason] = {}
@@ -130,9 +130,9 @@ def placed_markers(read: MarkerReadings, board: Markers) -> ReadMarkers:
                 "there may be another such board",
                 Code.AMBIGUOUS,
             )
-        elif view is None and fitting_side is not None:
+        elif view is None and own_side is not None:
             side = float(np.hypot(*(board[number][1] - board[number][0])))
-            message = f"marker {number} was read, but its side is about {fitting_side:.3g} mm against the distances, "
+            message = f"marker {number} was read, but its side is about {own_side:.3g} mm against the distances, "
             message += f"{side:.3g} mm being described: measure both on the board"
             refused[number] = Reason(message, Code.SIZE)
         elif view is None:
@@ -178,7 +178,7 @@ def _view(
     return view if 2 * agreeing > len(readings) and np.median(misfits) < half_border else None
 
 
-def _fitting_side(readings: Mapping[int, list[Array]], board: Markers, size_px: tuple[int, int]) -> float | None:
+def fitting_side(readings: Mapping[int, list[Array]], board: Markers, size_px: tuple[int, int]) -> float | None:
     """Side of the markers that fits the distances of their middles; None unless most of those read once agree on it."""
     single = {number: places[0] for number, places in readings.items() if len(places) == 1}
     if len(single) < _FEWEST_CORNERS:

@@ -11,6 +11,7 @@ from measure.array_types import Array
 from measure.boards.corner_fit import Corner, CornerStart, Surface, crossing, fit_corners, quarter
 from measure.boards.find import find_board
 from measure.boards.lattice import Place, find_grid, grid_of_any_count, grid_size, homography_steps
+from measure.boards.markers import fitting_side
 from measure.boards.specs import (
     AprilGridSpec,
     ArucoSpec,
@@ -38,6 +39,9 @@ _SMALLEST_DOT_PX = 5.0  # px, diameter
 _LARGEST_DOT, _FEWEST_DOTS = 1 / 6, 12  # of a grid of any count: fraction of the picture's longer side; dots
 _FEWEST_WIDTHS = 8  # dots: four determine how the board lies
 _LARGEST_RATIO = 1.25  # of a dot's width to the given one: tone curve and ink change small ones by a tenth
+# Deviation of the side of separate markers and squares from the given one, as a fraction and in px: tone curve and ink
+# move each edge by half a pixel.
+_WRONG_SIDE, _WRONG_SIDE_PX = 0.03, 1.5
 _NEAREST_DOTS = 8  # neighbours whose places and shapes predict a missing dot
 # Reach of the window along the edges, as fractions of a square's side unless in px:
 _REACH = 0.3  # illumination, distortion and flatness change little over it
@@ -53,6 +57,7 @@ _SHIFT_ROUNDS = 4  # views and shifts in turn; a view takes up less than a fifth
 _NEIGHBOURS = 4  # nearest crossings along the rows and columns
 _FEWEST_CROSSINGS = 30  # needed to distinguish coma from noise
 _WEAK_DAMAGE = 0.25  # fraction of the pixels around a corner: if more are rejected the corner is weak
+_DOUBTFUL_MISFIT = 0.03  # median of a board's markers above which their corners may be touched by squares, or not
 _WEAK_MISFIT = 0.075  # misfit: up to 0.062 on real boards; from 0.09 where the edges of shadows or lines moved corners
 
 
@@ -191,7 +196,11 @@ def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
     if isinstance(spec, CircleGridSpec):
         return _measure_circle_grid(scan, spec)
     board = find_board(scan, spec)
-    fitted = _fit_found(scan, board.corners, spec)
+    size_px = scan.width_px, scan.height_px
+    fitted, stand_alone = _fit_found(scan, board.corners, spec)
+    contradiction = _side_contradiction(fitted, spec, size_px)
+    if stand_alone:
+        fitted = _correct_edge_shift(fitted, board.corners, spec.object_points(), size_px)
     notes = board.notes
     if isinstance(spec, ChessboardSpec) and len(fitted) == spec.columns * spec.rows:
         fitted, notes = _named_by_colour(fitted, board.corners, spec)
@@ -208,10 +217,37 @@ def measure_board(scan: Scan, spec: BoardSpec) -> BoardMeasurement:
             refusal = board.refused.get(int(name.split(".")[0]), NO_REASON)
         marks.append(_corner_mark(name, fitted.get(name), refusal or unseen))
     measured = BoardMeasurement(
-        tuple(marks), board.reason, notes, tuple(board.refused.values()), is_mirrored=board.is_mirrored
+        tuple(marks),
+        board.reason,
+        notes,
+        tuple(board.refused.values()),
+        is_mirrored=board.is_mirrored,
+        contradiction=contradiction,
     )
     what = "squares" if isinstance(spec, SquareGridSpec) else "inner corners"
     return _unless_alone(scan, measured, f"boards of {spec.columns} x {spec.rows} {what}", board.others_px)
+
+
+def _side_contradiction(fitted: Mapping[str, Corner], spec: BoardSpec, size_px: tuple[int, int]) -> str:
+    """Sentence where separate markers or squares have another side, compared with their distances, than given."""
+    if not isinstance(spec, ArucoSpec | SquareGridSpec):
+        return ""
+    what, given_mm = ("squares", spec.square_mm) if isinstance(spec, SquareGridSpec) else ("markers", spec.marker_mm)
+    points, corners = spec.object_points(), {name: each for name, each in fitted.items() if not each.reason}
+    outlines = [[f"{name}.{k}" for k in range(4)] for name in dict.fromkeys(each.split(".")[0] for each in corners)]
+    whole = [names for names in outlines if corners.keys() >= set(names)]
+    sides_mm = {number: np.array([points[name][:2] for name in names]) for number, names in enumerate(whole)}
+    places_px = {number: [np.array([corners[name].center_px for name in names])] for number, names in enumerate(whole)}
+    side_mm = fitting_side(places_px, sides_mm, size_px)
+    if side_mm is None:
+        return ""
+    side_px = float(np.median([np.hypot(*(place[1] - place[0])) for (place,) in places_px.values()]))
+    if abs(side_mm / given_mm - 1.0) < max(_WRONG_SIDE, _WRONG_SIDE_PX / side_px):
+        return ""
+    return (
+        f"The board's {what} have a side of {side_mm:.3g} mm at distances of {given_mm + spec.gap_mm:g} mm, but "
+        f"{given_mm:g} mm are given: the side or the gap is wrong. Measure both on the board."
+    )
 
 
 def _unless_alone(scan: Scan, measured: BoardMeasurement, kind: str, others_px: Sequence[Array]) -> BoardMeasurement:
@@ -226,8 +262,8 @@ def _unless_alone(scan: Scan, measured: BoardMeasurement, kind: str, others_px: 
     return replace(measured, marks=tuple(mark.reject(why) for mark in measured.marks), ambiguous=why)
 
 
-def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) -> dict[str, Corner]:
-    """Fit the detected corners by least-squares matching."""
+def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) -> tuple[dict[str, Corner], bool]:
+    """Fit the detected corners by least-squares matching; and whether they are corners of separate squares."""
     points, starts, board_reach_px = spec.object_points(), list[CornerStart](), 0.0
     if found:
         # The effect of a camera's sharpening depends on the window: equal ones make it the same for all corners.
@@ -238,20 +274,29 @@ def _fit_found(scan: Scan, found: Mapping[str, FoundCorner], spec: BoardSpec) ->
         reach_px = _reach_px(np.hypot(*each.steps_px), spec, board_reach_px)
         starts.append(CornerStart(each.center_px, each.steps_px, reach_px, np.array(points[name][:2])))
 
+    def fits(stands_alone: bool) -> list[Corner]:
+        def read(col: int, row: int, side: int) -> ScanWindow:
+            place_px = col, row, side, side
+            # The place of a crossing does not depend on clipping.
+            sides = clipped_ends(scan.samples(*place_px), scan.full_scale_dn) if stands_alone else None
+            return ScanWindow(scan.window(*place_px), (col, row), scan.inside(*place_px, is_read=True), sides)
+
+        surface: Surface = quarter if stands_alone else crossing
+        return fit_corners(read, starts, surface, scan.quantisation_step_dn, scan.first_block_px)
+
     stands_alone = isinstance(spec, ArucoSpec | SquareGridSpec) and not isinstance(spec, AprilGridSpec)
+    corners = fits(stands_alone)
+    if isinstance(spec, ArucoSpec) and _median_misfit(corners) > _DOUBTFUL_MISFIT:
+        # Boards of either kind are printed with and without the squares that touch the corners of the markers.
+        others = fits(not stands_alone)
+        if _median_misfit(others) < _median_misfit(corners):
+            stands_alone, corners = not stands_alone, others
+    return dict(zip(found, corners, strict=True)), stands_alone
 
-    def read(col: int, row: int, side: int) -> ScanWindow:
-        place_px = col, row, side, side
-        # The place of a crossing does not depend on clipping.
-        sides = clipped_ends(scan.samples(*place_px), scan.full_scale_dn) if stands_alone else None
-        return ScanWindow(scan.window(*place_px), (col, row), scan.inside(*place_px, is_read=True), sides)
 
-    surface: Surface = quarter if stands_alone else crossing
-    corners = fit_corners(read, starts, surface, scan.quantisation_step_dn, scan.first_block_px)
-    fitted = dict(zip(found, corners, strict=True))
-    if not stands_alone:
-        return fitted
-    return _correct_edge_shift(fitted, found, points, (scan.width_px, scan.height_px))
+def _median_misfit(corners: Sequence[Corner]) -> float:
+    """Median misfit of corners, inf for those that could not be fitted; 0 for none."""
+    return float(np.median([np.inf if each.reason else each.misfit for each in corners])) if corners else 0.0
 
 
 # Shift of the edges of separate markers and squares by the tone curve and by ink, estimated from the board's geometry.

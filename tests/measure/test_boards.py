@@ -728,6 +728,45 @@ def test_markers_counted_from_below_are_those_of_an_aprilgrid(first: int) -> Non
         assert len(find_aruco(picture, drawn).corners) == 48
 
 
+def drawn_markers(spec: specs.ArucoSpec, is_touched: bool) -> NDArray[np.float64]:
+    """A board at 1 px per mm, blurred, the first corner at (19.5, 19.5); with dark squares that touch the markers."""
+    side, pitch = int(spec.marker_mm), int(spec.marker_mm + spec.gap_mm)
+    picture = np.full((spec.rows * pitch + 40, spec.columns * pitch + 40), 255.0)
+    for row, column in np.ndindex(spec.rows + is_touched, spec.columns + is_touched):
+        y, x = 20 + pitch * row, 20 + pitch * column
+        if row < spec.rows and column < spec.columns:
+            code = specs.aruco_dictionary(spec.dictionary)
+            picture[y : y + side, x : x + side] = cv2.aruco.generateImageMarker(code, spec.marker(row, column), side)
+        if is_touched:
+            picture[y + side - pitch : y, x + side - pitch : x] = 0.0
+    noise = np.random.default_rng(4).normal(0.0, 300.0, picture.shape)
+    return np.asarray(gaussian_filter(10_000.0 + 160.0 * picture, 0.9) + noise)
+
+
+@pytest.mark.parametrize("kind", [specs.ArucoSpec, specs.AprilGridSpec])
+@pytest.mark.parametrize("is_touched", [True, False])
+def test_markers_of_either_kind_are_measured_with_and_without_squares_between(
+    kind: type[specs.ArucoSpec], is_touched: bool
+) -> None:
+    spec = kind("APRILTAG_36h11", 3, 2, 60.0, 18.0)
+    board = measure_board(draw.make_scan(drawn_markers(spec, is_touched)), spec)
+    marks = {mark.point: mark for mark in board.marks if mark.status == Status.MEASURED}
+    assert not board.contradiction
+    assert len(marks) >= 12
+    for row, column in np.ndindex(2, 3):
+        for k, (right, down) in enumerate([(0, 0), (1, 0), (1, 1), (0, 1)]):
+            if mark := marks.get(f"{spec.marker(row, column)}.{k}"):
+                place_px = (19.5 + 78 * column + 60 * right, 19.5 + 78 * row + 60 * down)
+                np.testing.assert_allclose(mark.center_px, place_px, atol=0.06)
+
+
+@pytest.mark.parametrize("kind", [specs.ArucoSpec, specs.AprilGridSpec])
+def test_a_side_slightly_wrong_against_the_gap_is_named_with_the_right_one(kind: type[specs.ArucoSpec]) -> None:
+    scan = draw.make_scan(drawn_markers(kind("APRILTAG_36h11", 3, 2, 60.0, 18.0), kind is specs.AprilGridSpec))
+    board = measure_board(scan, kind("APRILTAG_36h11", 3, 2, 60.0, 22.0))
+    assert "markers have a side of 63.1 mm at distances of 82 mm, but 60 mm are given" in board.contradiction
+
+
 @parametrize_with_studies("given", [0, 30])
 def test_charuco_numbers_that_begin_later(given: int) -> None:
     """Shifted by two rows of markers, all would lie as on a board that begins at 0."""
