@@ -13,6 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.special import chdtri
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Distortion
@@ -57,6 +58,7 @@ UNDETERMINED = 0.05  # relative sigma of the principal distance above which no c
 WORSE_RMS = 1.02  # ratio of OpenCV's rms to the adjustment's that shows that its iteration stopped early
 ROUNDINGS = 20.0  # rms, in units of OpenCV's rounding of one coordinate, below which rounding dominates the residuals
 NOTABLE_SPREAD = 1.5  # ratio of the largest to the smallest sigma of marks, from which it is reported
+CHANCE = 0.05  # significance level of a difference of v'Pv between two solutions in a flat valley
 NOTABLE_ROUNDING = 0.01  # fraction of the standard deviation of an image coordinate
 
 
@@ -143,6 +145,7 @@ class _Solutions:
     solved: Adjustment
     conversion: ConvertedSolution
     opencv: OpenCvCalibration
+    inseparable: list[str]  # radial terms that the observations do not separate
 
     @property
     def camera(self) -> Camera:
@@ -153,10 +156,12 @@ class _Solutions:
         """Whether the residuals are larger than OpenCV's rounding, so that they tell the standard deviations."""
         return _rms_um(self.solved) > ROUNDINGS * self.opencv.rounding_um
 
-    @cached_property
-    def inseparable(self) -> list[str]:
-        """Radial terms that the observations do not separate."""
-        return self.solved.inseparable(self.camera.name)
+    @property
+    def gain(self) -> float:
+        """By how much v'Pv is smaller in OpenCV's solution, in the variance of a coordinate."""
+        points = sum(len(image.xyz) for image in self.problem.images)
+        squares_um2 = points * (_rms_um(self.solved) ** 2 - self.opencv.rms_um**2)
+        return squares_um2 / (1e3 * self.problem.sigma_mm * self.solved.sigma0) ** 2
 
     @cached_property
     def rows(self) -> tuple[stage_files.ComparedParameter, ...]:
@@ -185,7 +190,8 @@ def _compare(
         calibrate_fisheye if is_fisheye else calibrate, freedom=problem.freedom, start=conversion.parameters
     )
     opencv = _opencv_solution(problem.images, calibrated)
-    solutions = _Solutions(problem, solved, conversion, opencv)
+    inseparable = solved.inseparable(name) or adjustment.inseparable(name)
+    solutions = _Solutions(problem, solved, conversion, opencv, inseparable)
     if not solutions.rows:
         raise _NotPossible(
             f"{enumeration(solutions.inseparable)} cannot be separated, and nothing else is free: no parameter is left "
@@ -249,6 +255,14 @@ def _verdict(solutions: _Solutions, adjustment: Adjustment) -> tuple[stage_files
             "Given the very same model both programs agree. OpenCV's own model is not quite this lens: the refit "
             f"leaves {1e3 * solutions.conversion.residual_mm:.3f} µm, which {points} points notice. {reason}"
         )
+    if verdict == "differs" and solutions.inseparable:
+        chance = float(chdtri(len(solutions.inseparable), CHANCE))
+        if abs(solutions.gain) < chance:
+            verdict = "agrees"
+            reason = (
+                f"OpenCV ends elsewhere in the flat valley of these terms, no better: v'Pv differs by "
+                f"{abs(solutions.gain):.1f}, chance by up to {chance:.1f}. {reason.partition(';')[0]}."
+            )
     if verdict == "agrees" and solutions.has_residuals:
         verdict, reason = _judge_departure(reason, adjustment, solutions)
     if solutions.inseparable:

@@ -302,15 +302,33 @@ def test_verdict_on_the_whole() -> None:
     assert Check.from_cameras({"1": good}).reason == "a."
 
 
-def test_parameters_that_cannot_be_separated_are_not_compared_one_by_one() -> None:
-    """A lens without a denominator, which is free: both programs have the same images, and other k1 to k6."""
+def rational_network() -> Network:
+    """A lens without a denominator, which is free, in the middle of the images."""
     network = nets.lens_network("opencv", np.random.default_rng(3))
     middle = np.flatnonzero(np.linalg.norm(network.observations.xy_mm, axis=1) < 9.0)
     network = replace(network, observations=network.observations.only(middle))
     names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     free = Distortion("opencv", {name: Prior(0.0, np.inf) for name in names})
-    network = replace(network, cameras=(replace(network.cameras[0], distortion=free),))
-    check = check_against_opencv(adjust(network)).cameras["L"]
+    return replace(network, cameras=(replace(network.cameras[0], distortion=free),))
+
+
+@pytest.mark.parametrize(("better_rms", "verdict"), [(1.0, "agrees"), (0.98, "differs")])
+def test_another_place_in_a_flat_valley_differs_only_where_it_is_better(
+    monkeypatch: pytest.MonkeyPatch, better_rms: float, verdict: str
+) -> None:
+    def shifted(*arguments: Any, **options: Any) -> OpenCvCalibration:
+        found = calibrate(*arguments, **options)
+        return replace(found, parameters=found.parameters + 1.5 * found.sigmas, rms_um=better_rms * found.rms_um)
+
+    monkeypatch.setattr("pipeline.opencv_check.check.calibrate", shifted)
+    check = check_against_opencv(adjust(rational_network())).cameras["L"]
+    assert check.verdict == verdict
+    assert ("elsewhere in the flat valley" in check.reason) == (verdict == "agrees")
+
+
+def test_parameters_that_cannot_be_separated_are_not_compared_one_by_one() -> None:
+    """Both programs have the same images, and other k1 to k6."""
+    check = check_against_opencv(adjust(rational_network())).cameras["L"]
     assert check.verdict == "agrees"
     assert {row.name for row in check.rows} == {"fx", "cx", "cy", "p1", "p2"}
     assert "cannot be separated: the radial terms are not compared one by one" in check.reason
