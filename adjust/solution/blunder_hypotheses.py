@@ -13,7 +13,9 @@ import numpy as np
 from scipy.special import chdtrc
 
 from adjust.array_types import Array
-from adjust.functional_model.lens import Prior
+from adjust.functional_model.families import family
+from adjust.functional_model.lens import Distortion, Prior
+from adjust.functional_model.opencv_family import FISHEYE_NAMES
 from adjust.problem.network import Network, ObjectPoint
 from adjust.problem.parameter import shortened
 from adjust.solution.explanations import CHECKED
@@ -100,7 +102,8 @@ def network_hypotheses(network: Network, bare: Network, given: Adjustment | None
     misses = given is None or not given.converged or np.sqrt(np.mean(given.residuals.v_mm**2)) > large_mm
     is_stretched = is_far and misses and all(each.misfit < LARGE for each in transformed_fields(network))
     plane = _one_axis(network, (0, 1)) if is_stretched else ()
-    yield from ([each] for each in chain(exchanged, heights, mirrored_images, _distances(network), plane))
+    lenses = _fisheyes(network) if is_far else ()
+    yield from ([each] for each in chain(exchanged, heights, mirrored_images, _distances(network), plane, lenses))
 
 
 def _one_axis(network: Network, axes: Sequence[int]) -> Iterator[NetworkHypothesis]:
@@ -219,6 +222,21 @@ def _distances(network: Network) -> Iterator[NetworkHypothesis]:
                 replace(network, cameras=tuple(free if each is camera else each for each in network.cameras)),
                 "Correct it, or give it with the standard deviation that it has.",
                 figures=partial(_found_distance, camera.name, given.value),
+            )
+
+
+def _fisheyes(network: Network) -> Iterator[NetworkHypothesis]:
+    """Hypothesis: the lens of a camera, whose distortion is free in another family, is a fisheye."""
+    for camera in network.cameras:
+        distortion = camera.distortion
+        is_free = any(prior.sigma > 0.0 for prior in distortion.parameters.values())
+        if is_free and family(distortion.family).is_pinhole_at_zero:
+            fisheye = Distortion("opencv_fisheye", {name: Prior(0.0, np.inf) for name in FISHEYE_NAMES[:4]})
+            changed = replace(camera, distortion=fisheye)
+            yield NetworkHypothesis(
+                f"the lens of camera {camera.name} is a fisheye, which the family {distortion.family} is not for",
+                replace(network, cameras=tuple(changed if each is camera else each for each in network.cameras)),
+                'Give family = "opencv_fisheye" under [distortion], and k1 to k4 under [distortion.sigma].',
             )
 
 

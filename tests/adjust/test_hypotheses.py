@@ -1130,3 +1130,13 @@ def test_heights_of_some_points_in_another_unit_are_a_hypothesis_on_the_network(
     found = next(each for each in hypotheses if " for the others" in each.words)
     assert solver.trials.explains(solver.trials.adjust(found.network))
     assert found.words.startswith("Z of 8 of 16 points (0, 10, 12, 14, 2 and 3 more) is 3.281 times too large")
+
+
+def test_a_fisheye_in_a_family_that_is_not_for_it_is_named() -> None:
+    """In place of wrong point numbers, of which a divergence made suspect."""
+    network = nets.equidistant_network(np.random.default_rng(1), 1.1, 60.0, 5)
+    free = Distortion("opencv", dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), Prior(0.0, np.inf)))
+    with pytest.raises(
+        AdjustmentError, match=r"camera wide is a fisheye, which the family opencv is not for\. Without"
+    ):
+        adjust(nets.set_camera(network, distortion=free))
