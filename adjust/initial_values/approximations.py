@@ -34,6 +34,7 @@ from adjust.problem.unknowns import Reduction
 from adjust.validation import validate
 
 ON_A_LINE = 1e-6  # second extent of the known points over the first below which they lie on a line
+FAR_APART = 20.0  # gap between two groups of points, in the extent of the larger one, by which they are far apart
 MOST_FOLDED = 0.05  # largest fraction of points outside the invertible range of the distortion (gross errors)
 CLEARLY_WORSE = 5.0  # ratio of the median residuals above which a resection replaces a given orientation
 MOST_UNMET = 0.25  # share of points whose rays may not meet: more have another cause than mismatches
@@ -235,11 +236,27 @@ def _why_no_distance(fields: Sequence[KnownField]) -> str:
         )
     if where := _collinearity_words(np.concatenate([field.xyz for field in fields])):
         return f"all known points that they show lie {where}. Correct their coordinates."
+    if groups := _far_groups_words(np.concatenate([field.xyz for field in fields])):
+        return f"{groups}: those of one may be in another coordinate system. Correct their coordinates."
     return (
         "they see too few known points, or look straight at a flat field, where a longer principal distance is a "
         "larger distance from the field. Take images tilted by 20 to 40 degrees in different directions, or give "
         "principal_distance_mm with its standard deviation (0 fixes it)."
     )
+
+
+def _far_groups_words(xyz: Array) -> str:
+    """Whether points (n, 3) lie in two groups far apart for their extents, in words; "" if not."""
+    for axis, name in enumerate("XYZ"):
+        values = np.unique(xyz[:, axis])
+        gap = int(np.argmax(np.diff(values))) if len(values) > 1 else 0
+        below, above = values[: gap + 1], values[gap + 1 :]
+        if len(above) and above[0] - below[-1] > FAR_APART * max(np.ptp(below), np.ptp(above)) > 0.0:
+            return (
+                f"their known points lie in two groups, with {name} from {below[0]:.10g} to {below[-1]:.10g} and from "
+                f"{above[0]:.10g} to {above[-1]:.10g}"
+            )
+    return ""
 
 
 def _collinearity_words(xyz: Array) -> str:

@@ -40,6 +40,8 @@ MOST_PAIRS = 15  # pairs of frames tried as exchanged, largest residuals first
 ONE_AXIS = 10.0  # sigma0 that one axis in another unit leaves at least
 PITCHES = (10.0, 25.4, 100.0, 1000.0, 2.0)  # ratios of principal distances by another unit or pixel pitch
 ROUND = 0.05  # relative tolerance of these ratios
+SMALL_DEG = 0.5  # extent of a field that is flat enough for geographic coordinates times two factors
+EQUATORIAL_M, ECCENTRICITY = 6_378_137.0, 0.0818191908426  # of the ellipsoid WGS 84
 MIRRORED = "the points are mirrored: the sign of X, Y or Z of all of them is wrong, or two axes are exchanged"
 
 
@@ -102,8 +104,10 @@ def network_hypotheses(network: Network, bare: Network, given: Adjustment | None
     misses = given is None or not given.converged or np.sqrt(np.mean(given.residuals.v_mm**2)) > large_mm
     is_stretched = is_far and misses and all(each.misfit < LARGE for each in transformed_fields(network))
     plane = _one_axis(network, (0, 1)) if is_stretched else ()
-    lenses = _fisheyes(network) if is_far else ()
-    yield from ([each] for each in chain(exchanged, heights, mirrored_images, _distances(network), plane, lenses))
+    lenses = _fisheyes(network) if given is None or not given.converged else ()
+    degrees = _degrees(bare) if is_far else ()
+    further = chain(degrees, exchanged, heights, mirrored_images, _distances(network), plane, lenses)
+    yield from ([each] for each in further)
 
 
 def _one_axis(network: Network, axes: Sequence[int]) -> Iterator[NetworkHypothesis]:
@@ -114,6 +118,25 @@ def _one_axis(network: Network, axes: Sequence[int]) -> Iterator[NetworkHypothes
         by = np.diag(np.where(np.arange(3) == axis, factor, 1.0))
         words = f"{name} of all points is {times_too(factor)} for {others}: another unit"
         yield NetworkHypothesis(words, _move_points(network, by), moved=by)
+
+
+def _degrees(network: Network) -> Iterator[NetworkHypothesis]:
+    """Hypothesis: X and Y are geographic coordinates in degrees, those of a small field; heights are in m."""
+    plan = np.array(list(network.known_places.values())).reshape(-1, 3)[:, :2]
+    if not len(plan) or np.ptp(plan, axis=0).max() > SMALL_DEG or np.abs(plan).max(axis=0).min() < SMALL_DEG:
+        return
+    for words, axes in (("longitude and latitude", (0, 1)), ("latitude and longitude", (1, 0))):
+        latitude = np.radians(plan[:, axes[1]].mean())
+        if abs(latitude) < np.pi / 2.0:
+            flattened = 1.0 - ECCENTRICITY**2 * np.sin(latitude) ** 2
+            north = EQUATORIAL_M * (1.0 - ECCENTRICITY**2) / flattened**1.5
+            by = np.zeros((3, 3))
+            by[0, axes[0]], by[1, axes[1]], by[2, 2] = EQUATORIAL_M / np.sqrt(flattened) * np.cos(latitude), north, 1.0
+            by[:2] *= np.pi / 180.0
+            remedy = "Convert them to a map projection, UTM say, in the unit of Z."
+            yield NetworkHypothesis(
+                f"X and Y of all points are {words} in degrees", _move_points(network, by), remedy, by
+            )
 
 
 def _some_heights(network: Network) -> Iterator[NetworkHypothesis]:

@@ -1140,3 +1140,24 @@ def test_a_fisheye_in_a_family_that_is_not_for_it_is_named() -> None:
         AdjustmentError, match=r"camera wide is a fisheye, which the family opencv is not for\. Without"
     ):
         adjust(nets.set_camera(network, distortion=free))
+
+
+@pytest.mark.parametrize(("order", "words"), [([0, 1], "longitude and latitude"), ([1, 0], "latitude and longitude")])
+def test_points_in_degrees_are_named(order: list[int], words: str) -> None:
+    """A degree at 45 degrees of latitude is 78,847 m and 111,132 m long (tables of WGS 84)."""
+    field = nets.relief_field(300.0, n=16)
+    network = nets.project_field(field, nets.CONVERGENT_STATIONS[:3], kind="none").network
+    degrees = field[:, :2] / [78_847.0, 111_132.0] + [9.0, 45.0]
+    places = dict(zip((f"t{k}" for k in range(16)), np.column_stack([degrees[:, order], field[:, 2]]), strict=True))
+    points = nets.known_points({each.id: places[each.id] for each in network.points})
+    with pytest.raises(AdjustmentError, match=f"X and Y of all points are {words} in degrees"):
+        adjust(replace(network, points=points))
+
+
+def test_points_of_two_coordinate_systems_are_named() -> None:
+    field, far = nets.relief_field(300.0, n=16), np.array([500_000.0, 5_400_000.0, 0.0])
+    network = nets.project_field(field, nets.CONVERGENT_STATIONS[:3], kind="none").network
+    points = nets.known_points({f"t{k}": xyz + far * (k % 2) for k, xyz in enumerate(field)})
+    changed = nets.set_camera(replace(network, points=points), principal_distance_mm=None)
+    with pytest.raises(AdjustmentError, match=r"lie in two groups, with X from -.* to .* and from 499.* to 500"):
+        adjust(changed)
