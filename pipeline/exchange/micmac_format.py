@@ -26,6 +26,7 @@ MICMAC = Convention(
     "the files); ParamChantierPhotogram.xml (their elements); phgr_dist.cpp, cDistModStdPhpgr::Direct (distortion of "
     "the ideal point in px); cAppliOneReechMarqFid (pixel = (mm - box) / resolution)",
 )
+_CAMERA_IMAGE = "Glob"  # name of the image in MeasuresCamera.xml
 _Y_DOWN = np.array([1.0, -1.0])
 _KNOWN = {"KnownConv": "eConvApero_DistM2C"}
 _REECH = "OIS-Reech_"  # prefix of the files that ReSampFid writes
@@ -62,7 +63,7 @@ def _camera_files(block: ImageBlock, camera: str, options: ExportOptions) -> Wri
     files: dict[str, str | bytes] = {}
     left_out: tuple[str, ...] = ()
     if fiducials:
-        files["Ori-InterneScan/MeasuresCamera.xml"] = incoming.xml_text(*_marks("Glob", fiducials))
+        files["Ori-InterneScan/MeasuresCamera.xml"] = incoming.xml_text(*_marks(_CAMERA_IMAGE, fiducials))
         found = {frame.image: frame.observed_marks(fiducials=True) for frame in frames}
         few = [frame.image for frame in frames if len(found[frame.image]) < _FEWEST]
         reason = "fiducials are observed, and MicMac's affine fit needs three."
@@ -221,7 +222,10 @@ def _affine_misfit_px(frame: OutFrame, fiducials: Mapping[str, Array], box: Canv
 
 
 def import_micmac(paths: Sequence[Path], options: incoming.ImportOptions) -> incoming.Incoming:
-    """Read MeasuresIm-*.xml (fiducials), MeasuresCamera.xml (gives a camera file) and sets of marks (object points)."""
+    """Read MeasuresIm-*.xml (fiducials), MeasuresCamera.xml (gives a camera file) and sets of marks (object points).
+
+    Whatever its name, a file whose image is called as in MeasuresCamera.xml is one.
+    """
     marks: list[incoming.ForeignMark] = []
     cameras = []
     for path in paths:
@@ -230,13 +234,14 @@ def import_micmac(paths: Sequence[Path], options: incoming.ImportOptions) -> inc
         images = [root] if alone else root.findall("MesureAppuiFlottant1Im")
         if not images:
             raise InputError(f"{path}: has no <MesureAppuiFlottant1Im>. Measures of marks are read, and nothing else.")
-        if path.name == "MeasuresCamera.xml":
-            places = {point: place * _Y_DOWN for point, place, _ in _points(root, path)}
+        if path.name == "MeasuresCamera.xml" or (images[0].findtext("NameIm") or "").strip() == _CAMERA_IMAGE:
+            places = {point: place * _Y_DOWN for point, place, _ in _points(images[0], path)}
             if not places:
                 raise InputError(
                     f"{path}: has no mark <OneMesureAF1I>, so nothing is known of the camera. Name another."
                 )
-            cameras.append(incoming.fiducial_camera(path.parent.parent.name or "camera", places))
+            name = path.stem if path.name != "MeasuresCamera.xml" else path.parent.parent.name or "camera"
+            cameras.append(incoming.fiducial_camera(name, places))
             continue
         kind: Literal["fiducial", "target"] = "fiducial" if alone or options.fiducials else "target"
         for image in images:

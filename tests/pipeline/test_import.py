@@ -57,12 +57,13 @@ def test_marks_come_back_as_they_went(format: str, project: Path, tmp_path: Path
             assert given[id] == pytest.approx(xy, abs=1e-6)
 
 
-def test_fiducials_from_a_corner_give_no_principal_point(tmp_path: Path, capsys: Capture) -> None:
+@pytest.mark.parametrize("name", ["MeasuresCamera.xml", "t11.xml"])
+def test_fiducials_from_a_corner_give_no_principal_point(name: str, tmp_path: Path, capsys: Capture) -> None:
     """As published for a T-11, y down: the principal point lies near the middle of the marks, and is free."""
     places = {"P5": "0.000 117.521", "P6": "237.846 117.521", "P7": "120.428 0.000", "P8": "120.421 235.000"}
     one = "<OneMesureAF1I><NamePt>{}</NamePt><PtIm>{}</PtIm></OneMesureAF1I>"
     marks = "".join(one.format(id, xy) for id, xy in places.items())
-    file = tmp_path / "MeasuresCamera.xml"
+    file = tmp_path / name
     file.write_text(f"<MesureAppuiFlottant1Im><NameIm>Glob</NameIm>{marks}</MesureAppuiFlottant1Im>")
     path = imported("micmac", [file], tmp_path) / "camera.toml"
     words = "the files give no principal point. Adjusting starts at the middle of the fiducials, (118.9, -117.5) mm"
