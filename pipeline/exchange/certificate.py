@@ -44,6 +44,7 @@ _CURVE = 400  # samples of the curve whose extremes are balanced
 NUMBERS = Key("list of numbers", numbers)
 REACH_MM = (10.0, 500.0)  # from the axis to the last value of a table, of any film camera
 SMALLEST_UM = 0.1  # largest distortion of a table; no camera has less
+CONTRADICTING = 5.0  # standard deviations by which a distance is off
 DISTANCE_SIGMA_MM = 0.01  # of a distance between fiducials, where none is given
 MARKS_REACH = 4.0  # of a table and its fiducials: largest ratio
 
@@ -135,6 +136,7 @@ class Certificate:
                     "[[fiducial_distance]] with from, to, mm and sigma_mm.",
                 )
         self._check_units(key)
+        self._check_distances()
         has_two = self.autocollimation_mm is not None or self.symmetry_mm is not None
         if self.principal_point_mm is not None and has_two:
             raise WrongKey(
@@ -162,6 +164,28 @@ class Certificate:
         if 0.0 < np.abs(radial_mm).max() < SMALLEST_UM / 1000.0:
             largest_um = 1000.0 * np.abs(radial_mm).max()
             raise WrongKey("radial_um", f"is {largest_um:.2g} µm at most. Give µm: 3.0, not 0.003.")
+
+    def _check_distances(self) -> None:
+        """Raise WrongKey where a distance contradicts the others, or the coordinates of the fiducials."""
+        place = {one.id: np.array([one.xy_mm, np.broadcast_to(one.sigma_mm, 2)]) for one in self.fiducials}
+        if not self.fiducial:  # of which the distances make the figure
+            place = {id: each * [[1.0], [0.0]] for id, each in place.items()}
+        off = []
+        for one in self.distances:
+            if {one.start, one.end} <= place.keys():
+                (start, start_sigma), (end, end_sigma) = place[one.start], place[one.end]
+                found_mm = float(np.linalg.norm(end - start))
+                sigma_mm = float(np.hypot(one.sigma_mm, np.hypot(start_sigma, end_sigma).max()))
+                off.append((abs(found_mm - one.value_mm) / sigma_mm, found_mm, sigma_mm, one))
+        sigmas, found_mm, sigma_mm, worst = max(off, key=lambda each: each[0], default=(0.0, 0.0, 0.0, None))
+        if worst is not None and sigmas > CONTRADICTING:
+            where = "with the coordinates of the fiducials" if self.fiducial else "in the figure that fits all best"
+            raise WrongKey(
+                "fiducial_distance_mm" if self.fiducial_distance_mm else "fiducial_distance",
+                f"contradicts itself: {worst.start} to {worst.end} is {worst.value_mm:g} mm, but {found_mm:.3f} mm "
+                f"{where}, more than {CONTRADICTING:g} standard deviations ({sigma_mm:.2g} mm) off. Look for a "
+                "misprint, or give a larger fiducial_distance_sigma_mm.",
+            )
 
     @property
     def distance_mm(self) -> float:

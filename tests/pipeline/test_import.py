@@ -386,6 +386,23 @@ def test_a_certificate_of_distances(tmp_path: Path) -> None:
         read_certificate(table)
 
 
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"1-3": 213.0}, "in the figure that fits all best"),  # a misprint of 1 mm in a square of 212 mm
+        ({"2-1": 299.9}, "mm, but 299.8"),  # one distance twice, 0.087 mm apart
+        ({"1-3": 112.0, "1-4": 112.0, "2-3": 112.0, "2-4": 112.0}, "1 to 2 is 299.813 mm, but 22"),  # no triangle
+    ],
+)
+def test_distances_of_a_certificate_that_contradict_each_other_are_refused(
+    changed: dict[str, float], words: str, tmp_path: Path, refusal: Refusal
+) -> None:
+    known = {"1-2": 299.813, "3-4": 299.813, "1-3": 212.0, "1-4": 212.0, "2-3": 212.0, "2-4": 212.0} | changed
+    file = tmp_path / "old.toml"
+    file.write_text(CERTIFICATE + "[fiducial_distance_mm]\n" + "".join(f'"{p}" = {mm}\n' for p, mm in known.items()))
+    assert words in refusal("import", "certificate", file, tmp_path / "o")
+
+
 def test_a_certificate_of_distances_alone_places_its_marks(
     tmp_path: Path, refusal: Refusal, capsys: pytest.CaptureFixture[str]
 ) -> None:
