@@ -236,7 +236,8 @@ def _point(row: Row, pitch_um: tuple[float, float] | None) -> ComparatorPoint:
                 f"{row.file}: gives pixels but no mm, and nothing says how large a pixel is. Set pitch_um in "
                 "project.toml. A digital camera needs none if its camera file gives no length in mm."
             )
-    x, y, sx, sy = row.number(names[0]), row.number(names[1]), row.sigma(names[2]), row.sigma(names[3])
+    x, y = row.number(names[0]), row.number(names[1])
+    sx, sy = (row.sigma(name, "Leave it blank for the project's own.") for name in names[2:4])
     xy = None if x is None or y is None else np.array([x, y])
     if xy is None and Status(status).is_observation:
         raise row.error(

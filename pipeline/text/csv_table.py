@@ -18,6 +18,7 @@ from pipeline.text.wording import did_you_mean
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
 
 _LONGEST_NAME = 1000
+_NO_UTF_8 = "{}: is not text in UTF-8. Save it as such: in a spreadsheet as CSV UTF-8, separated by commas."
 _FORMULA = re.compile(r"'*[=+\-@]")
 _NO_FORMULA = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|-")  # a number, or a dash for none
 _TAKEN_FOR_TEXT = re.compile(r"'+[=+\-@]")
@@ -68,13 +69,16 @@ class Row:
             )
         return number
 
-    def sigma(self, column: str) -> float | None:
-        """Cell as a standard deviation, 0 or positive; None if it is blank. Raises InputError otherwise."""
+    def sigma(self, column: str, remedy: str = "Write 0 to fix the value.") -> float | None:
+        """Cell as a standard deviation, 0 or positive; None if it is blank. Raises InputError otherwise.
+
+        remedy: for one that is too small.
+        """
         sigma = self.number(column)
         if sigma is not None and sigma < 0.0:
             raise self.error(column, f"is a standard deviation and cannot be negative ({sigma:g}).")
         if sigma is not None and 0.0 < sigma < files.SMALLEST_SIGMA:
-            raise self.error(column, f"a standard deviation of {sigma:g} is too small. Write 0 to fix the value.")
+            raise self.error(column, f"a standard deviation of {sigma:g} is too small. {remedy}")
         return sigma
 
 
@@ -102,13 +106,13 @@ def read_csv(
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; a CSV file is needed here. Name one.") from None
     except UnicodeDecodeError:
-        raise InputError(
-            f"{path}: is not text in UTF-8. Save it as such: in a spreadsheet as CSV UTF-8, separated by commas."
-        ) from None
+        raise InputError(_NO_UTF_8.format(path)) from None
     header: list[str] = []
     for number, text in lines:
         if not text.strip() or text.lstrip().startswith("#"):
             continue
+        if not header and "\0" in text:  # as of UTF-16 without its mark
+            raise InputError(_NO_UTF_8.format(path))
         cells = _cells(path, number, text)
         if not header:
             header = cells

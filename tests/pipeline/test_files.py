@@ -401,9 +401,15 @@ TONE = 'camera = "camera.toml"\n[measure]\ntone = '
         (read_points, "point;X;Y;Z\n1;1;2;3\n", ["line 1", "semicolons", "commas are needed"]),
         (read_points, "point,X,Y,Z\n", ["no point"]),
         (read_points, "", ["is empty"]),
+        (read_points, "p\0o\0i\0n\0t\0,\0X\0", ["is not text in UTF-8"]),  # as of UTF-16 without its mark
         (read_comparator, f"{COMPARATOR}f,1,fiducial,1,2\nf,1,fiducial,3,4", ["line 3", "line 2", "fiducial '1'"]),
         (read_comparator, f"{COMPARATOR}f,1,fidu,1,2", ["'fidu'", "possible are"]),
         (read_comparator, f"{COMPARATOR}f,1,target,,2", ["x_mm", "blank"]),
+        (
+            read_comparator,
+            "image,point,kind,x_mm,y_mm,sx_mm,sy_mm\nf,1,target,1,2,1e-12,1e-12",
+            ["sx_mm", "too small", "Leave it blank"],
+        ),
         (read_project, f'{TONE}"2.2"', ["tone", "linear", "A number above 0, without quotes"]),
         (read_project, f"{TONE}-1.0", ["tone", "greater than 0"]),
         (read_toml, "k3 = free", ['Text stands in quotes: k3 = "free".']),

@@ -390,7 +390,7 @@ def test_a_certificate_of_distances(tmp_path: Path) -> None:
     ("changed", "words"),
     [
         ({"1-3": 213.0}, "in the figure that fits all best"),  # a misprint of 1 mm in a square of 212 mm
-        ({"2-1": 299.9}, "mm, but 299.8"),  # one distance twice, 0.087 mm apart
+        ({"2-1": 299.95}, "mm, but 299.8"),  # one distance twice, 0.137 mm apart
         ({"1-3": 112.0, "1-4": 112.0, "2-3": 112.0, "2-4": 112.0}, "1 to 2 is 299.813 mm, but 22"),  # no triangle
     ],
 )
