@@ -3,7 +3,7 @@
 In the cluster-robust covariance of the cameras, residuals within an image may be correlated; images are the clusters.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -20,7 +20,8 @@ from adjust.problem.problem import Problem, State
 from adjust.quality.run import Run, linear_derivatives
 from adjust.rank_defect.datum import free_motion
 
-FEWEST_IMAGES = 5  # needed to estimate standard deviations, then to about a third
+FEWEST_IMAGES = 3  # needed to leave one out
+PRIOR_FREEDOM = 4.0  # degrees of freedom of a group's common variance ratio against those of a single jackknife
 MOST_SHARED = 300  # shared quantities: with many unknown points the dense matrix would be too large
 LARGEST_SHARE = 0.999  # of one image in the information on some combination of unknowns; above, it rests on that image
 UNDETERMINED = 1e-9  # relative singular value of an image's equations, below which a direction is not determined
@@ -146,14 +147,15 @@ def _reported_by_unknowns(problem: Problem, state: State) -> csr_array:
     return matrix
 
 
-def cluster_covariance(run: Run, cofactor: Cofactor) -> Array | None:
+def cluster_covariance(run: Run, cofactor: Cofactor, variance: float) -> Array | None:
     """Covariance (n, n) of the quantities shared by images, 0 of others, by a delete-one-image jackknife.
 
     Each image is left out of the normal equations in turn. With N the normal matrix of the shared unknowns, N_i the
     part of image i, its own unknowns eliminated, and g_i its share of the right side, the shared unknowns change by
     d_i = -(N - N_i)^-1 g_i. The covariance is (m - 1) / m times the sum of (d_i - d)(d_i - d)' (Efron 1982; MacKinnon
     and White 1985, with images as clusters). It holds for any correlation of errors within an image, such as unmodelled
-    distortion causes. None with fewer than FEWEST_IMAGES images, or where some quantity rests on one image.
+    distortion causes. Of few images it is itself poorly known, hence `_moderated`. None with fewer than FEWEST_IMAGES
+    images, or where some quantity rests on one image. variance: of unit weight, for the model's covariance.
     """
     if (shares := _shares(run, cofactor)) is None or len(shares.of_images) < FEWEST_IMAGES:
         return None
@@ -162,9 +164,28 @@ def cluster_covariance(run: Run, cofactor: Cofactor) -> Array | None:
         return None
     spread = np.array(moves) @ shares.root.T
     spread -= spread.mean(axis=0)
+    freedom = len(moves) - 1
+    clusters = freedom / len(moves) * spread.T @ spread
+    parameters = (run.problem.unknowns.parameters[position] for position in shares.positions)
+    owners = [f"{each.kind} {each.owner}" for each in parameters]
     covariance = np.zeros((len(run.problem.unknowns),) * 2)
-    covariance[np.ix_(shares.positions, shares.positions)] = (len(moves) - 1) / len(moves) * spread.T @ spread
+    covariance[np.ix_(shares.positions, shares.positions)] = _moderated(
+        clusters, variance * shares.root @ shares.root.T, owners, freedom
+    )
     return covariance
+
+
+def _moderated(clusters: Array, model: Array, owners: Sequence[str], freedom: int) -> Array:
+    """Jackknife covariance (k, k) drawn towards the model's, enlarged by the common variance ratio of each owner.
+
+    As variances of few degrees of freedom are drawn towards a common one (Smyth 2004), in proportion to the degrees of
+    freedom; the ratio, at least 1, is the geometric mean over the owner's quantities.
+    """
+    ratios = np.maximum(np.diagonal(clusters) / np.maximum(np.diagonal(model), np.finfo(float).tiny), 1.0)
+    groups = np.unique(owners, return_inverse=True)[1]
+    factors = np.exp(np.bincount(groups, np.log(ratios)) / np.bincount(groups) / 2.0)[groups]
+    common = factors[:, None] * model * factors
+    return np.asarray((freedom * clusters + PRIOR_FREEDOM * common) / (freedom + PRIOR_FREEDOM))
 
 
 def larger_covariance(model: Array, clusters: Array) -> Array:

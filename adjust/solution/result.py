@@ -148,7 +148,7 @@ class Adjustment(estimates.Estimates, PlottedResult):
         It remains valid where errors within an image are correlated. Fixed quantities have zeros. None without a
         solution or with too few images (`adjust.quality.cofactor`).
         """
-        found = cluster_covariance(self.scaled, self.cofactor) if self.converged else None
+        found = cluster_covariance(self.scaled, self.cofactor, self.sigma0**2) if self.converged else None
         return None if found is None else found[np.ix_(*2 * [[self.index(each) for each in parameters]])]
 
     def larger_covariance_of(self, parameters: Sequence[Parameter]) -> Array:

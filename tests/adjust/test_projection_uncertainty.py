@@ -178,10 +178,33 @@ def values(result: Adjustment) -> list[float]:
 
 
 def test_it_is_the_jackknife_of_adjustments_without_one_picture_each() -> None:
+    """Drawn towards the common ratio to the model's variances, by 4 degrees of freedom against 5."""
     network = nets.board_network(np.random.default_rng(3), 6, 5e-4)
     left = np.array([values(adjust(drop_image(network, image.name))) for image in network.images])
-    spread = np.sqrt(5 / 6 * ((left - left.mean(axis=0)) ** 2).sum(axis=0))
-    np.testing.assert_allclose(scatter(adjust(network)), spread, rtol=0.03)
+    variances = 5 / 6 * ((left - left.mean(axis=0)) ** 2).sum(axis=0)
+    result = adjust(network)
+    model = np.array([result.sigma(Parameter.interior("desk", each)) ** 2 for each in QUANTITIES])
+    common = model * np.exp(np.log(np.maximum(variances / model, 1.0)).mean())
+    np.testing.assert_allclose(scatter(result), np.sqrt((5 * variances + 4 * common) / 9), rtol=0.03)
+
+
+def test_standard_deviations_from_four_pictures_cover_errors_of_each_picture() -> None:
+    """A smooth error of its own in each picture, up to some µm: by the model alone claims are 4 times too small."""
+    keys = [Parameter.interior("desk", each) for each in ("c", "x0", "y0")]
+    errors = list[np.ndarray]()
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        network = nets.board_network(rng, 4, 1e-4)
+        xy_mm, width_mm = network.observations.xy_mm.copy(), nets.BOARD_FRAME_MM[0]
+        for image in network.images:
+            rows = np.array(network.observations.image) == image.name
+            place = xy_mm[rows] * (2.0 / width_mm) - [1.0, -nets.BOARD_FRAME_MM[1] / width_mm]
+            terms = np.column_stack([place**2, place[:, 0] * place[:, 1], place**3])
+            xy_mm[rows] += 2e-3 * terms @ rng.normal(size=(5, 2))
+        result = adjust_unmodelled(nets.set_observations(network, xy_mm=xy_mm))
+        claims = np.sqrt(np.diagonal(result.larger_covariance_of(keys)))
+        errors.append((result.values_of(keys) - [nets.BOARD_TRUTH[each.quantity] for each in keys]) / claims)
+    assert 0.6 < np.sqrt(np.mean(np.square(errors))) < 1.4
 
 
 def test_prediction_errors_are_those_of_adjustments_without_a_fold() -> None:
@@ -203,8 +226,8 @@ def test_prediction_errors_are_those_of_adjustments_without_a_fold() -> None:
             assert predicted[names.index(name)] == pytest.approx(squares.mean(), rel=0.01)
 
 
-def test_few_pictures_tell_no_scatter() -> None:
-    result = adjust(nets.board_network(np.random.default_rng(1), 4, 5e-4))
+def test_two_pictures_tell_no_scatter() -> None:
+    result = adjust(nets.board_network(np.random.default_rng(1), 2, 5e-4))
     assert result.cluster_covariance_of([Parameter.interior("desk", "c")]) is None
     assert result.value(Parameter.interior("desk", "c")) == pytest.approx(2.7, abs=0.02)
 
