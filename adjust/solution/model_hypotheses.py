@@ -211,7 +211,7 @@ def _too_simple_words(camera: Camera, group: str, what: str) -> Words:
     elif fixed:
         remedy = f'Free {", ".join(fixed)} under [distortion.sigma] of the camera ("free").'
     else:
-        remedy = "Choose a distortion family with more terms, legendre(5) say; `reseau adjust --choose` compares some."
+        remedy = "Choose a distortion family with more terms, legendre(5) say; `reseau choose` compares some."
     wrong = [name for name in fixed if name in distortion.parameters and distortion.parameters[name].value]
     doubt = f", or what is given as exact, {', '.join(wrong)}, is wrong" if wrong else ""
     cause = f"The lens model of camera {camera.name} is too simple{doubt}: the residuals have {what}"

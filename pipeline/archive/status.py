@@ -168,7 +168,7 @@ def print_status(status: ArchiveStatus, console: Console, every: bool = False) -
         console.print(Text(status.sentence))
         console.print(table)
     else:
-        console.print("No scan has this verdict.")
+        console.print("No scan has this verdict." if every else "The project names no scans.")
     named, more = worst_named(status.scans, len(status.scans) if every else NAMED, every)
     for scan in named:
         console.print(Text(f"{scan.verdict}: {scan.image}{f': {scan.why}' if scan.why else ''}"), soft_wrap=True)

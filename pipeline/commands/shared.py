@@ -143,7 +143,9 @@ def summary_steps(project: Path, summary: "Summary") -> Iterator[str]:
     elif "report" not in files:
         yield command_step("run", project, why=_ALL_STAGES)
     elif adjustment is not None and adjustment.converged:
-        if any(camera.is_calibrated for camera in adjustment.cameras.values()):
+        if not summary.verdicts:  # whose sizes in pixels other programs need
+            yield command_step("export", project, "csv", "DIR", why="or parquet, bingo; others need the scans")
+        elif any(camera.is_calibrated for camera in adjustment.cameras.values()):
             yield command_step("export", project, "opencv", "DIR", why="or colmap, metashape, micmac, ...")
         else:
             yield command_step("resample", project, "DIR", why="rectifies the scans")

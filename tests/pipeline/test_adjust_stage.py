@@ -239,7 +239,9 @@ def fiducial_project(folder: Path, **errors: float) -> Path:
 
 def test_distances_between_fiducials_through_files(tmp_path: Path, printed_line: projects.Printed) -> None:
     """Affine films tell no form; six distances of a certificate do, with one to spare, and their table is written."""
-    assert "1 to 3: 299.81" in printed_line("run", fiducial_project(tmp_path))
+    project = fiducial_project(tmp_path)
+    assert "1 to 3: 299.81" in printed_line("run", project)
+    assert "The project names no scans." in printed_line("status", project)
     written = read_adjustment(tmp_path / "out" / "adjustment.json")
     assert [(row.start, row.end) for row in written.fiducial_distances] == SIX_DISTANCES
     redundancy = sum(row.redundancy for row in written.fiducial_distances)

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import typer
 from projects import (
     Capture,
     Printed,
@@ -30,6 +31,7 @@ from rich.console import Console
 from studies import parametrize_with_studies
 
 from pipeline.archive.verdicts import Verdict
+from pipeline.cli import app
 from pipeline.commands.shared import command_step, print_next, summary_steps
 from pipeline.errors import InputError
 from pipeline.exchange.exchange_stage import check_folder
@@ -273,6 +275,7 @@ def test_a_reader_that_stops_reading_does_not_change_the_exit_code(arguments: li
 
 
 PROJECT = Path("my project.toml")
+ROOT = Path(__file__).parents[2]
 
 
 def summary(*files: str, adjustment: Any = None, parts: int = 0, frames: Any = None, **verdicts: int) -> Any:
@@ -293,7 +296,11 @@ def adjustment(is_calibrated: bool) -> Any:
         (summary("measurement", FAILED=2), ["reseau measure 'my project.toml' --retry", "reseau run"]),
         (summary("measurement", OLD=1, WAITING=2), ["reseau measure 'my project.toml'  # 3 scans", "reseau run"]),
         (summary("adjustment", "covariance", adjustment=adjustment(True)), ["reseau check", "reseau report"]),
-        (summary("report", adjustment=adjustment(True)), ["open out/report", "reseau export"]),
+        (
+            summary("report", adjustment=adjustment(True), GOOD=4),
+            ["open out/report", "reseau export 'my project.toml' opencv"],
+        ),
+        (summary("report", adjustment=adjustment(True)), ["open out/report", "reseau export 'my project.toml' csv"]),
         (summary("report", adjustment=adjustment(False), LOOK=1, POOR=1), ["open", "reseau review", "reseau resample"]),
         (summary("measurement", frames={"a": {"absent": 4}}, POOR=1), ["reseau cameras --scan SCAN", "reseau review"]),
         (summary("part 1 of 8", parts=8), ["reseau merge 'my project.toml' out/measurement.*-of-8.db"]),
@@ -304,6 +311,17 @@ def test_a_summary_calls_for_what_mends_it_then_for_the_next_stage(given: Any, s
     assert len(found) == len(steps)
     for step, begins in zip(found, steps, strict=True):
         assert step.startswith(begins)
+
+
+def test_commands_that_messages_name_exist() -> None:
+    commands, named = vars(typer.main.get_command(app))["commands"], 0
+    for source in (file for package in ("adjust", "measure", "pipeline") for file in (ROOT / package).rglob("*.py")):
+        for name, options in re.findall(r"`reseau ([a-z]+)((?: --[a-z-]+)*)", source.read_text()):
+            assert name in commands, source
+            taken = {option for parameter in commands[name].params for option in parameter.opts}
+            assert taken.issuperset(options.split()), source
+            named += 1
+    assert named > 50
 
 
 def test_steps_counts_and_times_are_printed_in_one_form(capsys: Capture) -> None:
