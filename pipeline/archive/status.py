@@ -81,6 +81,8 @@ def archive_status(project: Project, path: Path | None = None) -> ArchiveStatus:
 
     path: of the database; None for the project's.
     """
+    if not project.scans:  # of a project whose marks are given, and perhaps are not drawn
+        return ArchiveStatus(())
     path = path or project.measurement_path
     rows, idle = dict[str, list[Any]](), tuple[str, ...]()
     if path.exists():
