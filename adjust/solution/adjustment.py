@@ -168,7 +168,8 @@ def _drop_contradicting(
 def _fit_unmodelled(network: Network, options: Options) -> Adjustment:
     """Adjust a network with standard deviations of unmodelled errors by camera with which v'Pv of its marks equals
     their redundancy, but none larger than an adjustment accepts: the lens may not suit at all."""
-    sigma_mm = {each.name: FIRST * float(np.hypot(*each.frame_mm)) for each in network.cameras}
+    largest_mm = largest_sigma_mm(network)
+    sigma_mm = {each.name: min(FIRST * float(np.hypot(*each.frame_mm)), largest_mm) for each in network.cameras}
     result = adjust(_add_unmodelled(network, sigma_mm), options=options)
     largest_mm = largest_sigma_mm(result.network)
     for _ in range(ROUNDS):

@@ -37,6 +37,7 @@ from measure.targets.sheets import fit_view_robustly
 _MIRROR = np.array([-1.0, 1.0])  # of column and row
 _SMALLEST_DOT_PX = 5.0  # px, diameter
 _LARGEST_DOT, _FEWEST_DOTS = 1 / 6, 12  # of a grid of any count: fraction of the picture's longer side; dots
+_LEAST_DOTS = 1 / 4  # fraction of all spots
 _FEWEST_WIDTHS = 8  # dots: four determine how the board lies
 _LARGEST_RATIO = 1.25  # of a dot's width to the given one: tone curve and ink change small ones by a tenth
 # Deviation of the side of separate markers and squares from the given one, as a fraction and in px: tone curve and ink
@@ -120,8 +121,8 @@ def recognise_dots(scan: Scan) -> str:
     if len(patches) < _FEWEST_DOTS:
         return ""
     grid = grid_of_any_count(np.array([patch.center_px for patch in patches]), _appearances(patches))
-    if grid is None or grid[0] * grid[1] < _FEWEST_DOTS * (1 + grid[2]):
-        return ""
+    if grid is None or grid[0] * grid[1] < max(_FEWEST_DOTS, _LEAST_DOTS * len(patches)) * (1 + grid[2]):
+        return ""  # a few of many spots lie on some grid
     columns, rows, is_staggered = grid
     kind, per_row = ("asymmetric-circle-grid", columns / 2) if is_staggered else ("circle-grid", columns)
     return f"--kind {kind} --board {per_row:g}x{rows} --marker DIAMETER"
@@ -258,7 +259,7 @@ def _unless_alone(scan: Scan, measured: BoardMeasurement, kind: str, others_px: 
     in_file = (np.add(place, scan.origin_px) for place in (middle, *others_px))
     places = " and ".join(f"({column:.0f}, {row:.0f})" for column, row in in_file)
     message = f"the scan shows {1 + len(others_px)} {kind}, about the pixels {places}, and nothing shows which is meant"
-    why = Reason(f"{message}: cover the others", Code.AMBIGUOUS)
+    why = Reason(f"{message}: cover the others, or cut pictures that two cameras share", Code.AMBIGUOUS)
     return replace(measured, marks=tuple(mark.reject(why) for mark in measured.marks), ambiguous=why)
 
 

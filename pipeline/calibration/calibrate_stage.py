@@ -327,8 +327,9 @@ def _nothing(
             with suppress(MeasurementError), open_scan(pictures.files[name]) as scan:
                 if options := board.differing_options(fitting_board(scan, board.spec)):
                     return f"{found}: the markers of {name} lie as with {options}. Give that if it is the board's."
-                if shown := recognise_dots(scan) or recognise_board(scan):
-                    shown = f": what {name} shows fits {shown}"
+                found_options = recognise_dots(scan) or recognise_board(scan)
+                if found_options and found_options not in board.chessboards:
+                    shown = f": what {name} shows fits {found_options}"
                     break
         return (
             f"{found}; of most: {_most_common(left_out.values())}. "

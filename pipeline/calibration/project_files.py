@@ -62,6 +62,12 @@ class BoardOptions:
         _ = self.table
 
     @property
+    def chessboards(self) -> tuple[str, ...]:
+        """Options that name this board, if it is a chessboard."""
+        sizes = (f"{self.columns:g}x{self.rows}", f"{self.rows}x{self.columns:g}")
+        return tuple(f"--board {size}" for size in sizes) if self.kind == "chessboard" else ()
+
+    @property
     def table(self) -> str:
         """Text of the table [targets] in project.toml."""
         keys: dict[str, object] = {"kind": self.kind, "columns": self.columns, "rows": self.rows}

@@ -240,6 +240,13 @@ def test_it_is_what_the_marks_err_by_beyond_what_is_given(given_mm: float, unmod
     assert result.sigma0 == pytest.approx(sigma0, rel=0.09)
 
 
+def test_a_board_small_in_the_picture_is_adjusted() -> None:
+    """One of a fortieth of the frame had been refused: the first unmodelled error was 5 % of the board."""
+    network = nets.set_camera(nets.board_network(np.random.default_rng(5), 6, 1e-4), frame_mm=(40.0, 30.0))
+    result = adjust_unmodelled(network)
+    assert result.value(Parameter.interior("desk", "c")) == pytest.approx(nets.BOARD_TRUTH["c"], abs=0.002)
+
+
 def test_what_is_wrong_with_a_picture_is_no_unmodelled_error_that_passes() -> None:
     """One of eight pictures is mirrored: that is refused, or said, and not taken for a lens that is a little poor."""
     network = nets.board_network(np.random.default_rng(7), 8, 5e-4, given_mm=1e-4)

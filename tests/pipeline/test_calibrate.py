@@ -15,6 +15,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import cv2
+import drawn as draw
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from scipy.spatial.distance import cdist
 
 from adjust import Approximations, Network, adjust
 from measure import Scan, open_scan
+from measure.boards.measure import recognise_dots
 from measure.boards.specs import ArucoSpec, BoardSpec, CharucoSpec, ChessboardSpec, CircleGridSpec, aruco_dictionary
 from measure.errors import MissingError
 from measure.flags import Status
@@ -539,8 +541,31 @@ def test_a_picture_of_three_corners_does_not_spoil_the_others(tmp_path: Path) ->
 def test_where_no_board_is_found_the_message_names_what_the_first_picture_shows(folder: Path, tmp_path: Path) -> None:
     pictures = find_pictures([folder], tmp_path)
     images = [name for camera in pictures.cameras for name in camera.images]
-    message = calibrate_stage._nothing(pictures, dict.fromkeys(images, "no marker was read"), {}, CHESSBOARD)
+    given = board_options("chessboard", "9x6", "20mm")
+    message = calibrate_stage._nothing(pictures, dict.fromkeys(images, "no board"), {}, given)
     assert message.endswith("that the board is in the picture: what p0 shows fits --board 7x5.")
+
+
+def test_the_given_board_is_not_proposed() -> None:
+    """Of pictures that two cameras share, which show it twice."""
+    given = [f"--board {size}" for size in ("7x5", "5x7")]
+    assert [*CHESSBOARD.chessboards] == given
+    assert not board_options("circle-grid", "7x5", "20mm", "9mm").chessboards
+
+
+def test_a_few_of_many_spots_are_no_grid_of_dots() -> None:
+    """Among 119 spots about a chessboard on a court 15 lay on some grid."""
+    rng = np.random.default_rng(1)
+    picture = np.full((480, 640), 220, np.uint8)
+    for row, column in np.ndindex(4, 5):
+        cv2.circle(picture, (140 + 40 * column, 160 + 40 * row), 11, (30,), -1)
+    picture = cv2.GaussianBlur(picture, (0, 0), 1.5)
+    with_spots = picture.copy()
+    for x, y in rng.uniform((10, 10), (630, 470), (220, 2)).astype(int):
+        if not (100 < x < 340 and 120 < y < 320):
+            cv2.circle(with_spots, (int(x), int(y)), int(rng.integers(3, 7)), (90,), -1)
+    assert recognise_dots(draw.make_scan(picture, 255)) == "--kind circle-grid --board 5x4 --marker DIAMETER"
+    assert not recognise_dots(draw.make_scan(with_spots, 255))
 
 
 @pytest.mark.parametrize(
