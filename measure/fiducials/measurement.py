@@ -157,6 +157,8 @@ def _fitting_pose(
     if frame is None or not frame.unblemished:
         return ()
     fitting = decide_scan_orientation(frame, ()).name
+    if fitting == options.pose:  # and what differs is something else
+        return ()
     sentence = (
         f"the marks fit in the scan orientation {fitting}, not in {options.pose}: this, or the sign or order of the "
         "given coordinates, is wrong."

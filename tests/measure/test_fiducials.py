@@ -1,6 +1,7 @@
 """Fiducial marks of whole frames drawn by brute force: the right names in every pose, and honest words where not."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Literal
 
 import drawn as draw
@@ -10,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 from studies import parametrize_with_studies
 
 from measure import Code, FiducialLayout, FiducialOptions, MarkShape, Status, dot, polygon
+from measure.fiducials import measurement
 from measure.fiducials.measure_frame import Frame, rename_frame
 from measure.fiducials.stages import find_frame
 from measure.geometry import POSES
@@ -110,6 +112,18 @@ def test_a_set_orientation_in_which_nothing_fits_is_named_with_the_one_that_does
     result = draw.measure_grey(draw.frame_picture(uneven, matrix), uneven, FiducialOptions(pose="0"))
     assert not any(mark.status.is_observation for mark in result.marks)
     assert result.problems[0].startswith("the marks fit in the scan orientation 180m, not in 0: this, or the sign or")
+
+
+@pytest.mark.parametrize(("found", "said"), [("90", ["the marks fit in the scan orientation 90, not in 0"]), ("0", [])])
+def test_the_set_orientation_is_not_contradicted_by_itself(
+    found: str, said: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame = SimpleNamespace(unblemished={0: None})
+    monkeypatch.setattr(measurement, "find_frame", lambda *_: SimpleNamespace(frame=frame))
+    monkeypatch.setattr(measurement, "decide_scan_orientation", lambda *_: SimpleNamespace(name=found))
+    scan, layout = draw.make_scan(np.zeros((9, 9))), draw.lay_out([MarkShape(draw.RING_CROSS)], ((0.0, 0.0),))
+    reasons = measurement._fitting_pose(scan, layout, None, FiducialOptions(pose="0"))
+    assert [each.split(":")[0] for each in reasons] == said
 
 
 def test_marks_places_decide_where_they_are_not_symmetric() -> None:
