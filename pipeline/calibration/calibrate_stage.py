@@ -203,7 +203,7 @@ class _CalibrationProject:
                     adjustment = adjust_marks(project, [mark for mark in marks if mark.image in images])
                     if adjustment.converged:
                         found[part] = camera_intrinsics(adjustment, camera, self.options.pixel_mm, {}, None, None, None)
-            if len(found) == len(parts) and (p := p_of_one_camera(list(found.values()))) < DIFFERENT:
+            if len(found) > 1 and (p := p_of_one_camera(list(found.values()))) < DIFFERENT:
                 each = "; ".join(f"*{part}*: {one.centre}" for part, one in found.items())
                 return (
                     "Pictures with different names are of different cameras, or of one refocused between them: that "

@@ -34,7 +34,7 @@ _Kind = tuple[int, int, float | None]  # width, height, focal length
 QUARTERS_DEG = (90, 270)
 TURNS_BY_TAG = {6: 90, 8: 270}  # Exif's Orientation of images that viewers turn back
 UNREAD_ENDINGS = (".heic", ".heif", ".avif", ".webp", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf")
-MOST_GROUPS, FEWEST_IN_GROUP = 8, 8  # of images by their names; of fewer the standard deviations are too small
+MOST_GROUPS, FEWEST_IN_GROUP = 8, 5  # of images by their names; fewer do not show that cameras differ
 PLAIN = 20.0  # twice the log-likelihood ratio; odds of e to the 10
 FEWEST_PICTURES = 3  # of a flat board with known turns, needed for principal distance and principal point
 

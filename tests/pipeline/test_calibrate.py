@@ -471,17 +471,15 @@ def test_what_is_wrong_with_pictures_is_given_in_pixels(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("apart_px", [0.0, 12.0])
-def test_pictures_of_two_cameras_are_distinguished_by_their_names(
-    apart_px: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pictures_of_two_cameras_are_distinguished_by_their_names(apart_px: float, tmp_path: Path) -> None:
     """They had been called distorted each in its own way. The second camera's principal point lies 12 px to the left;
     names that differ where cameras do not are nothing to speak of."""
-    monkeypatch.setattr("pipeline.calibration.pictures.FEWEST_IN_GROUP", 5)
     _, marks = simulated_marks(tmp_path)
     shift_mm = np.array([apart_px * CHESSBOARD_PIXEL_MM, 0.0])
     both = [replace(mark, image=f"left{mark.image}") for mark in marks]
     both += [replace(mark, image=f"right{mark.image}", xy_mm=present(mark.xy_mm) - shift_mm) for mark in marks]
-    images = tuple(dict.fromkeys(mark.image for mark in both))
+    lines = [replace(mark, image=f"side{mark.image}") for mark in marks if mark.point < "r1"]  # have no solution
+    images = tuple(dict.fromkeys(mark.image for mark in (*both, *lines)))
     files = {}
     for name in images:
         files[name] = tmp_path / f"{name}.png"
@@ -490,9 +488,9 @@ def test_pictures_of_two_cameras_are_distinguished_by_their_names(
     written = calibrate_stage._CalibrationProject(
         BoardPictureFiles(files, (camera,), {}), tmp_path, CalibrationOptions(CHESSBOARD), {"camera": "opencv4"}
     )
-    sentence = written.cameras_by_name(camera, both)
+    sentence = written.cameras_by_name(camera, [*both, *lines])
     assert bool(sentence) == bool(apart_px)
-    assert not written.cameras_by_name(camera, [mark for mark in both if mark.point < "r1"])  # lines give no solution
+    assert not written.cameras_by_name(camera, [mark for mark in both if mark.point < "r1"])
     assert not sentence or re.search(r"\*leftp\*: .* cx 20[23]\.\d.*\*rightp\*: .* cx 19[01]\.\d", sentence)
 
 
@@ -516,6 +514,7 @@ def test_parts_of_names_that_make_groups() -> None:
     folders = [f"cam{camera}/shot{number}_{camera}" for camera in (0, 1) for number in range(9)]
     assert [list(each) for each in name_parts(folders)] == [["0", "1"]]
     assert not list(name_parts([*(f"p{number}" for number in range(20)), "q1"]))
+    assert not list(name_parts(pairs[:8]))  # four of each
     assert not list(name_parts([]))
 
 
