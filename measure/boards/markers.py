@@ -193,7 +193,7 @@ def fitting_side(readings: Mapping[int, list[Array]], board: Markers, size_px: t
     ratios, alike = list[float](), 0
     for number, place in single.items():
         predicted = view.places_px(board[number])
-        ratios.append(float(np.sqrt(_area(place) / _area(predicted))))
+        ratios.append(float(np.sqrt(_area(place) / max(_area(predicted), 1e-9))))  # 0 where the view has no image
         scaled = ratios[-1] * (predicted - predicted.mean(axis=0))
         off = (scaled - (place - place.mean(axis=0))) / _side_px(place)
         alike += _off(view, board[number], place) < _OFF_SQUARES and np.sqrt((off**2).sum(axis=1).mean()) < _ALIKE
@@ -209,8 +209,10 @@ def _area(outline: Array) -> float:
 
 
 def _misfit(view: SheetView, corners: Array, image_px: Array) -> float:
-    """RMS distance of a marker's corners from their predicted places, in sides of the marker."""
-    return float(np.sqrt(np.mean(np.sum((view.places_px(corners) - image_px) ** 2, axis=1)))) / _side_px(image_px)
+    """RMS distance of a marker's corners from their predicted places, in sides of the marker, both about their middle:
+    a fisheye displaces whole markers against a view."""
+    off_px = view.places_px(corners) - image_px
+    return float(np.sqrt(np.mean(np.sum((off_px - off_px.mean(axis=0)) ** 2, axis=1)))) / _side_px(image_px)
 
 
 def _off(view: SheetView | None, corners: Array, image_px: Array) -> float:

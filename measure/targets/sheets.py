@@ -107,22 +107,28 @@ def fit_view(view: SheetView, points: Array, observed_px: Array) -> SheetView | 
         return None
     start = SheetView(homography, view.radial, view.size_px)
     terms = 0 if len(points) < _RADIAL_FROM else 1 if len(points) < _SECOND_RADIAL_FROM else 2
-    scale = np.abs(homography).max(axis=0)
+    # Two terms of a board that covers a part of the picture may both be large, and one of them not.
+    fits = (_fit_terms(start, points, observed_px, count) for count in range(terms, max(terms - 2, -1), -1))
+    return next((found for found in fits if np.abs(found.radial).max() < _LARGEST_RADIAL), start)
+
+
+def _fit_terms(start: SheetView, points: Array, observed_px: Array, terms: int) -> SheetView:
+    """Fit a view with some radial terms, 0 to 2."""
+    scale = np.abs(start.homography).max(axis=0)
 
     def view_from_parameters(values: Array) -> SheetView:
-        matrix = np.append(values[:8], homography[2, 2] / scale[2]).reshape(3, 3) * scale
-        return SheetView(matrix, np.append(values[8:], np.zeros(2 - terms)), view.size_px)
+        matrix = np.append(values[:8], start.homography[2, 2] / scale[2]).reshape(3, 3) * scale
+        return SheetView(matrix, np.append(values[8:], np.zeros(2 - terms)), start.size_px)
 
     def residuals(values: Array) -> Array:
         candidate = view_from_parameters(values)
         difference = candidate.undistorted(observed_px) - candidate.ideal(points)
         return np.nan_to_num(difference, nan=1.0).ravel()
 
-    values = np.append((start.homography / scale).ravel()[:8], view.radial[:terms])
+    values = np.append((start.homography / scale).ravel()[:8], start.radial[:terms])
     width = max(robust_scale(residuals(values)), 1e-4)
     solution = least_squares(residuals, values, loss="soft_l1", f_scale=width, max_nfev=30)
-    found = view_from_parameters(solution.x)
-    return found if np.abs(found.radial).max() < _LARGEST_RADIAL else start
+    return view_from_parameters(solution.x)
 
 
 def fit_view_robustly(points: Array, observed_px: Array, size_px: tuple[int, int]) -> SheetView | None:

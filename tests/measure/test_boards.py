@@ -19,7 +19,15 @@ from measure.boards import find, specs
 from measure.boards.edge_curvature import edge_curvatures
 from measure.boards.find import is_even, recognise_board, whole_pattern
 from measure.boards.lattice import grid_of_any_count
-from measure.boards.markers import ReadMarkers, charuco_board, find_aruco, find_charuco, off_corners
+from measure.boards.markers import (
+    MarkerReadings,
+    ReadMarkers,
+    charuco_board,
+    find_aruco,
+    find_charuco,
+    off_corners,
+    placed_markers,
+)
 from measure.boards.measure import BoardMeasurement, measure_board, one_definition
 from measure.flags import Cause, Code
 from measure.results import Covariance, MarkMeasurement
@@ -806,6 +814,26 @@ def test_a_grid_of_april_tags_has_its_corners_at_the_junctions(turn_deg: float, 
     other = measure_board(draw.make_scan(picture), replace(APRIL_GRID, first_marker=0))
     assert "but as with first marker 5" in other.reason
     assert recognise_board(draw.make_scan(picture)) == "--kind aprilgrid --board COLUMNSxROWS"
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.6])
+@pytest.mark.parametrize("shift_mm", [(0.0, 0.0), (60.0, 40.0), (120.0, 80.0)])
+def test_the_markers_of_a_board_in_a_fisheye_agree(tilt: float, shift_mm: tuple[float, float]) -> None:
+    """An equidistant lens, r = c θ, and tags up to 65 degrees off its axis: all of them had been refused."""
+    spec = specs.AprilGridSpec("APRILTAG_36h11", 6, 6, 24.0, 7.2)
+    points = spec.object_points()
+    middle_mm = np.mean([point[:2] for point in points.values()], axis=0)
+    turn = np.asarray(cv2.Rodrigues(np.array([tilt, tilt / 2, 0.0]))[0])
+    board = {number: np.array([points[f"{number}.{corner}"][:2] for corner in range(4)]) for number in range(36)}
+    outlines = {}
+    for number, corners in board.items():
+        flat = np.column_stack([(corners - middle_mm) * [1.0, -1.0], np.zeros(4)])
+        x, y, z = (flat @ turn.T + [*shift_mm, 100.0]).T
+        radius = np.hypot(x, y)
+        outlines[number] = [511.5 + (382.0 * np.arctan2(radius, z) / radius)[:, None] * np.stack([x, y], axis=1)]
+    read = placed_markers(MarkerReadings(outlines, (1024, 1024), 0.2), board)
+    assert read.agreeing == 36
+    assert not read.refused
 
 
 @parametrize_with_studies("kind", ["aprilgrid", "charuco", "aruco"], quick=(2,))
