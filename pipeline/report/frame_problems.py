@@ -1,6 +1,7 @@
 """Problems of the measurement of frames that need a look before any adjustment, and the test for pixel locking."""
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
@@ -9,7 +10,7 @@ from markupsafe import Markup
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import bdtrik, chdtrc
 
-from measure.flags import Code
+from measure.flags import Code, Status
 from pipeline.archive.verdicts import NEXT_STEP
 from pipeline.drawing import svg
 from pipeline.report.data import Mark, ReportedFrame, ReportedProblem
@@ -206,10 +207,12 @@ def _measurement_problems(frame: ReportedFrame) -> Iterator[ReportedProblem]:
             yield ReportedProblem(drop_file_name(problem, frame.scan.scan) if frame.scan else problem)
     doubtful = [mark for mark in frame.marks if mark.needs_review]
     lost, weak = ([mark for mark in doubtful if mark.status.is_observation is is_used] for is_used in (False, True))
-    found = sum(mark.is_fiducial and mark.status.is_observation for mark in frame.marks)
+    statuses = Counter(mark.status for mark in frame.marks if mark.is_fiducial)
+    found = ", ".join(f"{statuses[each]} {each}" for each in (Status.MEASURED, Status.WEAK) if statuses[each])
     if lost and (found or pose):  # otherwise the frame was not found, which is a problem of its own
         yield ReportedProblem(
-            f"{counted(len(lost), 'fiducial mark')} not measured, {found} measured. Reasons: {_reasons(lost)}.",
+            f"{counted(len(lost), 'fiducial mark')} not measured, {found or 'none measured'}. "
+            f"Reasons: {_reasons(lost)}.",
             "Settle them with `reseau review`."
             + (" The frame is used; its film transformation is less precise." if found else ""),
             marks=tuple((frame.image, mark.kind, mark.point) for mark in lost),

@@ -194,6 +194,8 @@ def test_a_problem_has_reason_remedy_link_and_thumbnail(adjusted_data: ReportDat
     assert "1 thing needs a look" in text
     assert f"f1: 1 fiducial mark not measured, 7 measured. Reasons: 3 rejected: {reason}" in text
     assert "7 of 8 (1 rejected)" in text
+    weak = set_mark(set_mark(adjusted_data, 2, Status.REJECTED, reason), 3, Status.WEAK, "covered")
+    assert "f1: 1 fiducial mark not measured, 6 measured, 1 weak. Reasons: 3 rejected" in rendered(weak).text
 
 
 def test_nothing_is_loaded_from_anywhere_and_every_drawing_has_words() -> None:
