@@ -169,9 +169,10 @@ def cluster_covariance(run: Run, cofactor: Cofactor, variance: float) -> Array |
     parameters = (run.problem.unknowns.parameters[position] for position in shares.positions)
     owners = [f"{each.kind} {each.owner}" for each in parameters]
     covariance = np.zeros((len(run.problem.unknowns),) * 2)
-    covariance[np.ix_(shares.positions, shares.positions)] = _moderated(
-        clusters, variance * shares.root @ shares.root.T, owners, freedom
-    )
+    # Without the part of pseudo-observations, a datum's for one, which leaving out an image does not show.
+    derivatives = np.concatenate([by_shared @ shares.root.T for by_shared, _ in shares.of_images])
+    model = variance * derivatives.T @ derivatives
+    covariance[np.ix_(shares.positions, shares.positions)] = _moderated(clusters, model, owners, freedom)
     return covariance
 
 

@@ -177,7 +177,8 @@ class ProjectionUncertainty:
     median_distance : of the targets that were observed.
     places_mm : (..., 2) of the points, in the camera frame.
     covariance_mm2 : (..., 2, 2) by the model; nan where the lens forms no image.
-    cluster_covariance_mm2 : (..., 2, 2) by the delete-one-image jackknife; None where images are too few.
+    cluster_covariance_mm2 : (..., 2, 2) by the delete-one-image jackknife; None where no error is unmodelled
+        or images are too few.
     """
 
     camera: str

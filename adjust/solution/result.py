@@ -192,7 +192,8 @@ class Adjustment(estimates.Estimates, PlottedResult):
         See docs/method/reliability.md for the effects that are removed. Raises AdjustmentError without a solution, for
         an unknown camera or for one without targets.
         """
-        return projection_uncertainty(self, self.cluster_covariance_of, camera, distance, places_mm)
+        clusters = self.cluster_covariance_of if self.unmodelled_mm else lambda _: None
+        return projection_uncertainty(self, clusters, camera, distance, places_mm)
 
     def plots(self, camera: str = "", pixel_mm: float | None = None) -> CameraPlots:
         """Collect the data for the plots of a camera, optional where there is one.

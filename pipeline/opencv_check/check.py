@@ -58,7 +58,7 @@ UNDETERMINED = 0.05  # relative sigma of the principal distance above which no c
 WORSE_RMS = 1.02  # ratio of OpenCV's rms to the adjustment's that shows that its iteration stopped early
 ROUNDINGS = 20.0  # rms, in units of OpenCV's rounding of one coordinate, below which rounding dominates the residuals
 NOTABLE_SPREAD = 1.5  # ratio of the largest to the smallest sigma of marks, from which it is reported
-CHANCE = 0.05  # significance level of a difference of v'Pv between two solutions in a flat valley
+SIGNIFICANCE_LEVEL = 0.05  # of a difference of v'Pv between two solutions in a flat valley
 NOTABLE_ROUNDING = 0.01  # fraction of the standard deviation of an image coordinate
 
 
@@ -256,12 +256,12 @@ def _verdict(solutions: _Solutions, adjustment: Adjustment) -> tuple[stage_files
             f"leaves {1e3 * solutions.conversion.residual_mm:.3f} µm, which {points} points notice. {reason}"
         )
     if verdict == "differs" and solutions.inseparable:
-        chance = float(chdtri(len(solutions.inseparable), CHANCE))
-        if abs(solutions.gain) < chance:
+        critical = float(chdtri(len(solutions.inseparable), SIGNIFICANCE_LEVEL))
+        if abs(solutions.gain) < critical:
             verdict = "agrees"
             reason = (
                 f"OpenCV ends elsewhere in the flat valley of these terms, no better: v'Pv differs by "
-                f"{abs(solutions.gain):.1f}, chance by up to {chance:.1f}. {reason.partition(';')[0]}."
+                f"{abs(solutions.gain):.1f}, critical value {critical:.1f}. {reason.partition(';')[0]}."
             )
     if verdict == "agrees" and solutions.has_residuals:
         verdict, reason = _judge_departure(reason, adjustment, solutions)

@@ -18,7 +18,6 @@ from adjust.problem.estimates import adjusted_image, observed_places
 from adjust.problem.network import EXTERIOR_NAMES, Board, Image, ObjectPoint
 from adjust.problem.parameter import Kind, Parameter
 from adjust.quality.critical_values import Tested
-from adjust.quality.lens_uncertainty import projection_uncertainty
 from adjust.quality.reliability import Reliability, Suspect
 from adjust.quality.significance import CalibrationTest, SignificanceTest
 from adjust.solution.result import Adjustment
@@ -203,9 +202,8 @@ def _projection(adjustment: Adjustment, camera: str) -> Iterator[records.Project
     """Precision of projected points at infinity and at the median distance of the targets."""
     if len(adjustment.network.images) > MOST_IMAGES:
         return
-    by_images = adjustment.cluster_covariance_of if adjustment.unmodelled_mm else lambda _: None
-    infinite = projection_uncertainty(adjustment, by_images, camera)
-    near = projection_uncertainty(adjustment, by_images, camera, infinite.median_distance)
+    infinite = adjustment.projection_uncertainty(camera)
+    near = adjustment.projection_uncertainty(camera, infinite.median_distance)
     for known in (infinite, near):
         x_mm, y_mm = known.places_mm[0, :, 0], known.places_mm[::-1, 0, 1]
         sigma_um = [[float(f"{UM_PER_MM * each:.4g}") for each in row] for row in known.sigma_mm[::-1]]

@@ -14,6 +14,7 @@ from adjust import Adjustment, AdjustmentError, Distortion, Parameter, Prior, ad
 from adjust.functional_model.rotation import rotation_from_vector
 from adjust.problem.estimates import adjusted_image, adjusted_lens
 from adjust.problem.network import Approximations, Board, Network
+from adjust.quality.lens_uncertainty import projection_uncertainty
 from adjust.solution.adjustment import adjust_unmodelled
 
 Array = NDArray[np.float64]
@@ -114,12 +115,14 @@ def test_three_hundred_boards_scatter_as_it_says(distance: float) -> None:
 
 
 def test_the_datum_of_the_marks_has_no_part_in_it() -> None:
-    rng = np.random.default_rng(2)
-    network, start = nets.simulated(rng, points=nets.field_points(rng, 40))
-    result = adjust(network, start)
-    sigma_mm = result.projection_uncertainty("K", 1500.0, FILM_MM).sigma_model_mm
+    rng, truth = np.random.default_rng(4), nets.Truth()
+    lens = dict.fromkeys(truth.distortion, np.inf)
+    result = adjust(*nets.simulated(rng, truth, points=nets.field_points(rng, 20), free=lens))
+    found = projection_uncertainty(result, result.cluster_covariance_of, "K", 1500.0, FILM_MM)
     assert result.sigma(Parameter.interior("K", "x0")) > 0.3
-    assert sigma_mm.max() < 0.005
+    assert found.sigma_model_mm.max() < 0.01
+    assert found.sigma_clusters_mm is not None
+    assert 0.3 < np.median(found.sigma_clusters_mm / found.sigma_model_mm) < 2.0
 
 
 def test_it_covers_the_picture_and_stops_where_the_lens_does() -> None:
@@ -134,9 +137,11 @@ def test_it_covers_the_picture_and_stops_where_the_lens_does() -> None:
     assert np.isnan(far.sigma_mm).all()
 
 
-def test_the_larger_of_both_standard_deviations_is_shown() -> None:
-    found = adjust(nets.board_network(np.random.default_rng(3), 6, 5e-4)).projection_uncertainty()
+def test_the_larger_of_both_standard_deviations_is_shown_where_errors_are_unmodelled() -> None:
+    network = nets.board_network(np.random.default_rng(3), 6, 5e-4, given_mm=1e-4)
+    found = adjust_unmodelled(network).projection_uncertainty()
     assert found.sigma_clusters_mm is not None
+    assert adjust(network).projection_uncertainty().sigma_clusters_mm is None
     np.testing.assert_array_equal(found.sigma_mm, np.maximum(found.sigma_model_mm, found.sigma_clusters_mm))
 
 

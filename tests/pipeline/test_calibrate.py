@@ -555,10 +555,10 @@ def test_the_given_board_is_not_proposed() -> None:
 def test_a_few_of_many_spots_are_no_grid_of_dots() -> None:
     """Among 119 spots about a chessboard on a court 15 lay on some grid."""
     rng = np.random.default_rng(1)
-    picture = np.full((480, 640), 220, np.uint8)
+    picture = np.full((480, 640), 220.0)
     for row, column in np.ndindex(4, 5):
         cv2.circle(picture, (140 + 40 * column, 160 + 40 * row), 11, (30,), -1)
-    picture = cv2.GaussianBlur(picture, (0, 0), 1.5)
+    picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 1.5), np.float64)
     with_spots = picture.copy()
     for x, y in rng.uniform((10, 10), (630, 470), (220, 2)).astype(int):
         if not (100 < x < 340 and 120 < y < 320):

@@ -99,7 +99,7 @@ def test_the_larger_covariance_is_converted_saved_and_used(tmp_path: Path, print
     known, names = read_covariance(first), ("c", "x0", "y0", "k1", "k2", "p1", "p2", "b1", "b2")
     keys = [Parameter.interior("L", name) for name in names]
     sigmas = np.sqrt(np.diag(known.select_larger(keys)))
-    assert sigmas[3] > 3.0 * np.sqrt(known.select(keys[3:4])[0, 0])
+    assert sigmas[3] > 2.0 * np.sqrt(known.select(keys[3:4])[0, 0])
     written = json.loads(first.read_text())["cameras"]["L"]
     quantities = written["principal_distance_mm"], *written["principal_point_mm"].values(), written["distortion"]["k1"]
     clusters = np.sqrt(np.diag(present(known.clusters).select(keys[:4])))
