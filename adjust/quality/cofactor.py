@@ -207,16 +207,17 @@ def prediction_errors(run: Run, cofactor: Cofactor, folds: int) -> Array | None:
 
     One fold of images at a time is left out and oriented by the camera from the others. Without them the shared
     unknowns change by d, as in `cluster_covariance`, and their residuals r become r - B d (PRESS: Allen 1974, with
-    images in place of observations). None where some quantity rests on the images of one fold.
+    images in place of observations). nan where some quantity rests on the images of a fold;
+    None with too many shared unknowns.
     """
     if (shares := _shares(run, cofactor)) is None:
         return None
     images = shares.of_images
-    errors = np.zeros(len(images))
+    errors = np.full(len(images), np.nan)
     for fold in (range(first, len(images), folds) for first in range(min(folds, len(images)))):
         move = _move(*map(np.concatenate, zip(*(images[image] for image in fold), strict=True)))
         if move is None:
-            return None
+            continue
         for image in fold:
             by_shared, right = images[image]
             errors[image] = 2.0 * float(np.mean((right - by_shared @ move) ** 2))

@@ -575,7 +575,7 @@ def _frames_by_error(result: Adjustment, predicted: bool) -> list[_FrameError]:
     variances = np.diagonal(network.observations.covariance_mm2, axis1=1, axis2=2)
     squares = (result.residuals.v_mm**2 / variances).sum(axis=1)  # without a solution no residual is standardised
     of_others = result.prediction_errors(len(numbers)) if predicted else None
-    errors = np.bincount(of_frame, squares) if of_others is None else of_others
+    errors = np.bincount(of_frame, squares) if of_others is None or np.isnan(of_others).any() else of_others
     shares = errors / np.maximum((cameras[:, None] == cameras) @ errors, 1e-300)
     medians = np.array([np.median(squares[of_frame == frame]) for frame in range(len(numbers))])
     # Without a solution the worst mark is as large as any.

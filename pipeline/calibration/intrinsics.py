@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from rich.console import Console
 from rich.table import Column, Table
-from scipy.special import fdtrc
+from scipy.special import fdtrc, ndtr, stdtrit
 
 from adjust.errors import AdjustmentError
 from adjust.functional_model.lens import Distortion, Prior
@@ -32,7 +32,7 @@ PARAMETERS: dict[LensModel, tuple[str, ...]] = {
     "fisheye": ("k1", "k2", "k3", "k4"),
 }  # each but the last extends the one before
 FOLDS = 5
-FEWEST_VALIDATED = 6  # images needed for the cross-validation
+ONE_SIGMA = ndtr(1.0)  # of Student's t: predictions are better by a standard error of many images, more of few
 WIDE = 1.0  # half the image's diagonal over the principal distance, above which a fisheye is tried: 45 degrees
 HIGHLY_CORRELATED = 0.9  # from which a correlation is listed
 ONE_UNKNOWN = 1.0 - 1e-9  # correlation of fx and fy of square pixels
@@ -61,9 +61,10 @@ def choose_lens(
 ) -> LensChoice:
     """Select the lens model of a camera by cross-validation over its images.
 
-    One fifth of the images is left out in turn. Their points are predicted with the camera of the others, after a space
-    resection of each, using the normal equations of all images. A model with more parameters is taken where its
-    predictions are better by more than the standard error of the difference over the images.
+    One fifth of the images, at least one, is left out in turn. Their points are predicted with the camera of the
+    others, after a space resection of each, using the normal equations of all images. A model with more parameters is
+    taken where its predictions are better by more than the standard error of the difference over the images, or with
+    few images by what has the same probability.
 
     Parameters
     ----------
@@ -73,8 +74,6 @@ def choose_lens(
     adjusted : adjusts a network, from initial values if given
     start : values of an adjustment with the first model
     """
-    if len(network.images) < FEWEST_VALIDATED:
-        return LensChoice("opencv4", {})
     squares: dict[LensModel, dict[str, float]] = {}  # by image
     best: LensModel = "opencv4"
     (camera,), is_wide = network.cameras, False
@@ -90,7 +89,8 @@ def choose_lens(
             fitted = None
         errors = None if fitted is None else fitted.prediction_errors(FOLDS)
         names = [] if fitted is None or errors is None else [image.name for image in fitted.network.images]
-        squares[model] = dict(zip(names, () if errors is None else errors.tolist(), strict=True))
+        predicted = zip(names, () if errors is None else errors.tolist(), strict=True)
+        squares[model] = {name: error for name, error in predicted if np.isfinite(error)}
         start = start if fitted is None else fitted.start
         if model == "opencv4":
             c_mm = 0.0 if fitted is None else fitted.value(Parameter.interior(camera.name, "c"))
@@ -110,7 +110,8 @@ def _is_better(squares: Mapping[str, float], than: Mapping[str, float]) -> bool:
     if len(common) < 2:
         return len(squares) > len(than)
     gain = np.array([than[image] - squares[image] for image in common])
-    return bool(gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)))
+    least = stdtrit(len(gain) - 1, ONE_SIGMA) * gain.std(ddof=1) / np.sqrt(len(gain))
+    return bool(gain.mean() > least)
 
 
 _FIGURES = ("rms_px", "sigma0", "corner_sigma_px", "unmodelled_sigma_px", "known_share")
@@ -225,7 +226,7 @@ class CameraIntrinsics:
             f"Corners {self.corner_sigma_px:.3f} px, unmodelled {self.unmodelled_sigma_px:.3f} px: what lens model, "
             "board and the picture's processing leave."
         )
-        if self.lens is not None and self.lens.rms_px:
+        if self.lens is not None and self.lens.rms_px[self.lens.model] is not None:
             rms_px = {
                 model: "no solution" if rms is None else f"{rms:.3f} px" for model, rms in self.lens.rms_px.items()
             }

@@ -707,12 +707,22 @@ def choose_wide_lens(network: Network, unmodelled_mm: float, monkeypatch: pytest
     return calibrate_stage._chosen_lens(project, first, camera, options)
 
 
-def test_a_fisheye_is_taken_where_the_first_lens_does_not_suit_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("images", [4, 9])
+def test_a_fisheye_is_taken_where_the_first_lens_does_not_suit_at_all(
+    images: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Errors not modelled are so large that twice as much would be refused as of another unit."""
-    network = equidistant_network(np.random.default_rng(3), 1.1, 200.0, 9)
+    network = equidistant_network(np.random.default_rng(3), 1.1, 200.0, images)
     choice = choose_wide_lens(network, 0.006, monkeypatch)
     assert choice.model == "fisheye"
     assert choice.rms_px["fisheye"] == pytest.approx(np.sqrt(2.0) * 1e-4 / PIXEL_MM, rel=0.2)
+
+
+@pytest.mark.parametrize(("count", "better"), [(3, False), (12, True)])
+def test_few_pictures_need_a_larger_gain(count: int, better: bool) -> None:
+    """Gains of -0.5, 1 and 2 are 1.15 standard errors of three pictures (1.32 needed), 2.6 of twelve."""
+    richer, simpler = ({f"i{k}": each[k % 3] for k in range(count)} for each in ((0.0,) * 3, (-0.5, 1.0, 2.0)))
+    assert intrinsics._is_better(richer, simpler) == better
 
 
 @pytest.mark.parametrize(
