@@ -133,7 +133,7 @@ def adjust_unmodelled(network: Network, options: Options | None = None, pixel_mm
         f"{plausible_mm[name] / PLAUSIBLE / sigma_mm:.0f} of the picture's diagonal. Look for pictures that are "
         "blurred or moved, for a wrong size or count of the board, and whether the lens model suits."
         for name, sigma_mm in result.unmodelled_mm.items()
-        if sigma_mm > plausible_mm[name] > 0.0
+        if result.converged and sigma_mm > plausible_mm[name] > 0.0
     )
     return replace(result, remarks=(*result.remarks, *warnings))
 

@@ -314,9 +314,9 @@ def _notes(data: ReportData, shots: list[ReportedFrame]) -> Iterator[str]:
         yield from _corners_notes(data.check)
     if data.adjustment:
         yield from data.adjustment.notes
-        yield from _unmodelled_notes(data, data.adjustment)
         yield from _weight_notes(data.adjustment)
     if solved := _solution(data):
+        yield from _unmodelled_notes(data, solved)
         yield from _sigma0_notes(solved)
     if data.is_film_alone:
         yield (

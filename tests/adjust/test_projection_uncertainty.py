@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from adjust import Adjustment, AdjustmentError, Distortion, Parameter, Prior, adjust, approximate
+from adjust import Adjustment, AdjustmentError, Distortion, Options, Parameter, Prior, adjust, approximate
 from adjust.functional_model.rotation import rotation_from_vector
 from adjust.problem.estimates import adjusted_image, adjusted_lens
 from adjust.problem.network import Approximations, Board, Network
@@ -272,3 +272,11 @@ def test_an_implausible_one_is_a_warning() -> None:
     for pixel_mm, size in ((None, r"[45](\.\d+)? µm"), (0.01, r"0\.[45]\d* px")):
         words = rf"errors of {size} are not modelled, one part in [78]\d\d of"
         assert any(re.search(words, warning) for warning in adjust_unmodelled(network, pixel_mm=pixel_mm).warnings)
+
+
+def test_without_a_solution_no_unmodelled_error_is_claimed() -> None:
+    """The first value, a thousandth of the frame's diagonal, was told as one."""
+    network = nets.board_network(np.random.default_rng(5), 6, 5e-4, given_mm=1e-4)
+    result = adjust_unmodelled(network, Options(iteration_limit=1))
+    assert not result.converged
+    assert not any("not modelled" in warning for warning in result.warnings)
