@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from adjust import Adjustment, adjust
 from benchmarks.harness import Row, rms
-from measure.tie_points.features import TieFrame
 from measure.tie_points.joins import measure_joins
+from measure.tie_points.tracks import TieFrame
 from pipeline.cli import run
 
 Array = NDArray[np.float64]

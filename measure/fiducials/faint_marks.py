@@ -2,7 +2,7 @@
 
 Alone, such a mark cannot be distinguished from the many places where noise resembles it. With a certain constellation
 only responses as strong and as close to the predicted place compete. Their expected number follows from the texture
-(`measure.detection.significance`), as does the covariance of the place. The strength of the texture relative to the
+(`measure.detection.correlation`), as does the covariance of the place. The strength of the texture relative to the
 lines depends on the tone curve. Where that is unknown, the mark is searched with two curves, and the difference enters
 the covariance.
 """
@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure.array_types import Array, Mask
+from measure.detection.correlation import expected_peaks
 from measure.detection.localisation import MarkPrediction
-from measure.detection.significance import expected_peaks
 from measure.flags import NO_REASON, Cause, Code, Reason
 from measure.marks.rendering import detail_px, extent_px, picture
 from measure.matching.window import FAINT, Coding

@@ -14,7 +14,7 @@ from measure.matching.frame_edge import fit_frame_corner
 from measure.matching.match import match
 from measure.matching.models import MatchOptions
 from measure.matching.window import FAINT, pixels_beyond_edge, read_window
-from measure.noise.grain import BESIDE_PX
+from measure.noise.noise_model import BESIDE_PX
 from measure.results import MarkFit
 from measure.scans.jpeg import covariance_of_compression, tone_variance
 from measure.scans.scan import Scan

@@ -8,9 +8,8 @@ from operator import attrgetter
 import numpy as np
 
 from measure.array_types import Array
-from measure.detection.correlation import WIDE, Surroundings
+from measure.detection.correlation import WIDE, Surroundings, chance_of_marks
 from measure.detection.responses import MarkView, Responses, SearchEffort, correlate_scan, correlate_windows
-from measure.detection.significance import chance_of_marks
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, lattice_steps_mm, mark_sign
 from measure.fiducials.options import FiducialOptions
 from measure.geometry import POSES, UP_FROM_CAMERA, reduced_px

@@ -18,8 +18,7 @@ from typing import Literal
 import numpy as np
 
 from measure.array_types import Array
-from measure.detection.correlation import CLOSE, GRAINY, WIDE, Surroundings
-from measure.detection.significance import chance_of_marks, share_of_places
+from measure.detection.correlation import CLOSE, GRAINY, WIDE, Surroundings, chance_of_marks, share_of_places
 from measure.fiducials.camera_recognition import find_pitch_mm
 from measure.fiducials.constellation import AS_GOOD, FREE_MARKS, NARROW, Placement, distinct_places, same_picture
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA

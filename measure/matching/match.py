@@ -28,8 +28,16 @@ from measure.matching.gauss_newton import EDGE_BLURS, PictureFit
 from measure.matching.models import GREY, FitState, MatchOptions, PictureModel, background_px, smoothed_px2
 from measure.matching.tone_information import mark_tone_information, sharpening_score
 from measure.matching.window import ScanWindow
-from measure.noise.grain import blank_patches, grain_model, is_coloured
-from measure.noise.noise_model import NoiseModel, combine, is_textured, least_squares_factors, white_noise_model
+from measure.noise.noise_model import (
+    NoiseModel,
+    blank_patches,
+    combine,
+    grain_model,
+    is_coloured,
+    is_textured,
+    least_squares_factors,
+    white_noise_model,
+)
 from measure.results import Covariance, MarkFit
 
 _WIDER = 1.05  # relative width of lines, step of the difference

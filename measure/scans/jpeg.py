@@ -55,7 +55,7 @@ from measure.scans.metadata import (
     pitch_from_density,
     tag_pitch,
 )
-from measure.tone.declared import ColourTags
+from measure.tone.curve import ColourTags
 
 Decode = Callable[[bytes], NDArray[np.generic]]
 

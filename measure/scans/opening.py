@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 
 from measure.errors import MeasurementError, MissingError
-from measure.scans.bmp_and_pnm import BMP_START, PNM_STARTS, open_plain, plain_form
 from measure.scans.cache import LostPart, OpenedPicture, Segments, WholePicture
 from measure.scans.jpeg import (
     BLOCK_PX,
@@ -24,15 +23,19 @@ from measure.scans.jpeg import (
 from measure.scans.metadata import DECODING_ERRORS, NO_TAGS, PictureForm, Pitch, Samples, damage_error
 from measure.scans.parallel import map_in_threads
 from measure.scans.png_and_jpeg2000 import (
+    BMP_START,
     JPEG2000_END,
     JPEG2000_STARTS,
     PNG_END,
     PNG_START,
+    PNM_STARTS,
     jpeg2000_colour_tags,
     jpeg2000_form,
     jpeg2000_pitch,
     open_jpeg2000,
+    open_plain,
     open_png,
+    plain_form,
     png_colour_tags,
     png_form,
     png_pitch,
@@ -40,8 +43,7 @@ from measure.scans.png_and_jpeg2000 import (
 from measure.scans.remote import Address, ScanPart, Window, scan_path
 from measure.scans.scan import Scan
 from measure.scans.tiff import TIFF_STARTS, open_tiff, tiff_colour_tags
-from measure.tone.curve import Tone
-from measure.tone.declared import tone_of_tags
+from measure.tone.curve import Tone, tone_of_tags
 
 _OPENERS = {
     **dict.fromkeys(TIFF_STARTS, open_tiff),

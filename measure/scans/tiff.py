@@ -43,7 +43,7 @@ from measure.scans.metadata import (
     unsupported_error,
 )
 from measure.scans.remote import Address, Extent, ScanPart
-from measure.tone.declared import ColourTags
+from measure.tone.curve import ColourTags
 
 _MOST_DIRECTORIES, _MOST_TAGS = 1000, 4096  # of a file and of a directory: more are damage
 _WHOLE = (1, 3, 4, 13, 16, 18)  # types of unsigned integers

@@ -20,7 +20,7 @@ from measure.marks.shapes import Polarity
 from measure.noise.robust_estimation import robust_scale
 from measure.scans.scan import Scan
 from measure.targets.block_search import Octave, Patches, ScanBlock, TargetCandidate, concatenate, search_blocks
-from measure.targets.disk_fit_batch import fit_disks
+from measure.targets.disks import LEAST_SNR, fit_disks
 
 Sampler = Callable[[NDArray[np.intp], Array], Single]
 
@@ -38,7 +38,6 @@ _EVERY = 8  # sampling step for the texture and noise estimates
 _WORST_MISFIT = 0.075  # rms distance of an outline from its ellipse, in radii, without noise
 _NOISE_SIGMAS = 1.5  # factor on the expected misfit from noise, an rms over many rays
 _EDGE_PX = 2.5  # height over steepest slope of an edge with a blur of one pixel
-LEAST_SNR = 4.0  # of a disk that is measured
 _LEAST_FLAT = 0.05  # shorter over longer half axis, squared
 _SCALE_STEP = 1.5  # ratio of consecutive radii: between them the response falls by a tenth
 _SIZE_TOLERANCE = 1.4  # factor on the stated sizes

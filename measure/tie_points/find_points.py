@@ -21,16 +21,20 @@ from measure.flags import NO_REASON, POINT_REFUSED, Code, Reason, Status
 from measure.noise.robust_estimation import robust_scale
 from measure.results import Covariance, MarkMeasurement, largest_sigma_px
 from measure.scans.parallel import map_or_replace
-from measure.tie_points.features import Features, TieFrame, find_all_features, read_pieces, unreachable
 from measure.tie_points.multi_image import RADIUS_PX, Bending, Matched, Piece, bending_variance, match_pieces
 from measure.tie_points.tracks import (
     FEWEST_PAIRS,
+    Features,
     Shared,
     TieCandidate,
+    TieFrame,
     candidates_with_radius,
     epipolar_outliers,
+    find_all_features,
     find_candidates,
     neighbour_outliers,
+    read_pieces,
+    unreachable,
     verify_pairs,
 )
 

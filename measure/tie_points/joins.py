@@ -19,17 +19,17 @@ from measure.errors import MeasurementError
 from measure.flags import NO_REASON, POINT_REFUSED, Cause, Code, Reason, Status
 from measure.results import Covariance, MarkMeasurement
 from measure.scans.parallel import map_or_replace
-from measure.tie_points.features import (
+from measure.tie_points.find_points import Ties
+from measure.tie_points.multi_image import RADIUS_PX, Matched, match_pieces
+from measure.tie_points.tracks import (
     Features,
     TieFrame,
     find_all_features,
     interleave_groups,
+    neighbour_outliers,
     read_pieces,
     shared_features,
 )
-from measure.tie_points.find_points import Ties
-from measure.tie_points.multi_image import RADIUS_PX, Matched, match_pieces
-from measure.tie_points.tracks import neighbour_outliers
 
 WANTED = 60  # joins per pair of scans
 _FEW = 12  # fewer joins are reported as a problem

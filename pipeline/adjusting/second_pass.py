@@ -9,7 +9,7 @@ import numpy as np
 
 from adjust.problem.estimates import adjusted_image, adjusted_places
 from adjust.solution.result import Adjustment
-from measure.fiducials.scan_checks import drop_lost_marks
+from measure.fiducials.measurement import drop_lost_marks
 from measure.flags import Code, Reason, Status
 from measure.results import ON_FILM, MarkMeasurement
 from measure.scans.opening import open_scan

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from measure.detection.recurrence import Recurrence, Window, recurrence, resample_square
+from measure.detection.localisation import Recurrence, Window, recurrence, resample_square
 from measure.errors import MeasurementError
 from measure.fiducials.clicked_frame import LEAST_CLICKS, are_collinear
 from measure.fiducials.interior_orientation import fit_frame

@@ -12,8 +12,7 @@ import numpy as np
 
 from measure.annotations.text import MISSING, networks
 from measure.errors import MeasurementError, MissingError, TooLargeError, UnreachableError
-from measure.fiducials.measurement import measure_fiducials
-from measure.fiducials.scan_checks import other_frames, pitch_problem, report_damage
+from measure.fiducials.measurement import measure_fiducials, other_frames, pitch_problem, report_damage
 from measure.flags import Code, Reason, Status
 from measure.marks.rendering import extent_px
 from measure.results import FrameMeasurement, MarkMeasurement, shift_frame

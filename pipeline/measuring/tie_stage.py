@@ -11,9 +11,9 @@ from measure.flags import Code, Reason, Status
 from measure.geometry import Affine
 from measure.results import MarkMeasurement
 from measure.scans.remote import scan_path
-from measure.tie_points.features import TieFrame
 from measure.tie_points.find_points import measure_ties
 from measure.tie_points.joins import measure_joins
+from measure.tie_points.tracks import TieFrame
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TieSettings

@@ -16,7 +16,7 @@ from studies import parametrize_with_studies
 
 from measure import Status, open_scan
 from measure.boards import find, specs
-from measure.boards.edge_curvature import edge_curvatures
+from measure.boards.corner_fit import edge_curvatures
 from measure.boards.find import is_even, recognise_board, whole_pattern
 from measure.boards.lattice import grid_of_any_count
 from measure.boards.markers import (

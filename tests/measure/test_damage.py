@@ -14,7 +14,7 @@ from damaged_files import DAMAGES, measure_file, outcome, stored
 from numpy.typing import NDArray
 
 from measure import FrameMeasurement, MeasurementError, Status, open_scan
-from measure.fiducials.scan_checks import report_damage
+from measure.fiducials.measurement import report_damage
 from measure.noise.robust_estimation import damage
 
 CASES = 20  # of each damage in each kind of file, in the study

@@ -12,10 +12,18 @@ from studies import parametrize_with_studies
 from true_marks import KIND, some_mark
 
 from measure import FiducialOptions, MatchOptions
-from measure.detection.correlation import CLOSE, GRAINY, Map, Surroundings, correlation
+from measure.detection.correlation import (
+    CLOSE,
+    GRAINY,
+    Map,
+    Surroundings,
+    chance_of_marks,
+    correlation,
+    expected_peaks,
+    share_of_places,
+)
 from measure.detection.localisation import MarkPrediction, localise
 from measure.detection.responses import ByteCache, MarkView, Responses, correlate_scan
-from measure.detection.significance import chance_of_marks, expected_peaks, share_of_places
 from measure.fiducials.faint_marks import FaintMark, detect_faint
 from measure.fiducials.mark_fit import detect_mark
 from measure.flags import Cause

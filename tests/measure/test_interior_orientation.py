@@ -21,8 +21,7 @@ from measure.fiducials.across_frames import check_frames
 from measure.fiducials.constellation import Bounds, Placement, PlacementSearch, same_picture
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA, FrameFit, film_terms, fit_frame
 from measure.fiducials.measure_frame import Frame, detect_frame, detect_some, fit_lines_and_sharpening, measure_frame
-from measure.fiducials.measurement import _lacks_its_own, present_frame
-from measure.fiducials.scan_checks import pitch_problem
+from measure.fiducials.measurement import _lacks_its_own, pitch_problem, present_frame
 from measure.fiducials.scan_orientation import DISTURBANCE_P, MarkSite, OrientedMark, decide_scan_orientation
 from measure.fiducials.search import FrameSearch, PitchHypothesis, SearchResult
 from measure.fiducials.stages import Kind, Stage, StageResult, doubt_frame, find_frame

@@ -11,8 +11,16 @@ from measure import FiducialOptions, MarkFit, MatchOptions, match
 from measure.detection.localisation import MarkPrediction
 from measure.fiducials.mark_fit import detect_mark
 from measure.matching.window import clipped_ends, noise_scale, read_window
-from measure.noise.grain import _KERNELS, GRAIN_PX, PATCH_PX, PLANE, grain_model
-from measure.noise.noise_model import influence_covariances, noise_model, steadiness
+from measure.noise.noise_model import (
+    _KERNELS,
+    GRAIN_PX,
+    PATCH_PX,
+    PLANE,
+    grain_model,
+    influence_covariances,
+    noise_model,
+    steadiness,
+)
 from measure.tone.curve import Tone, power
 
 FULL = 65535.0

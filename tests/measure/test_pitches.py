@@ -22,9 +22,8 @@ from measure.detection.responses import SearchEffort
 from measure.fiducials import stages
 from measure.fiducials.channel_weights import best_weights, registered_channels
 from measure.fiducials.measure_frame import Frame, measure_frame
-from measure.fiducials.measurement import coarseness
+from measure.fiducials.measurement import coarseness, other_frames, pitch_problem
 from measure.fiducials.options import CLICK_SIGMA_PX, Click
-from measure.fiducials.scan_checks import other_frames, pitch_problem
 from measure.fiducials.search import FrameSearch, PitchHypothesis, SearchResult, false_placements, is_lattice
 from measure.flags import Cause, Code, Reason
 from measure.geometry import POSES

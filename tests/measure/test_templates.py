@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 from measure import ScanWindow
-from measure.detection.recurrence import recurrence
+from measure.detection.localisation import recurrence
 from measure.fiducials.across_frames import check_frames
 from measure.fiducials.mark_comparison import check_own_figures, unlike_blur, unlike_others
 from measure.flags import Cause, Reason, Status

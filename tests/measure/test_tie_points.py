@@ -13,11 +13,17 @@ from numpy.typing import NDArray
 from studies import parametrize_with_studies
 
 from measure.flags import Cause
-from measure.tie_points.features import Features, TieFrame
 from measure.tie_points.find_points import Ties
 from measure.tie_points.joins import measure_joins
 from measure.tie_points.multi_image import RADIUS_PX, SPARE_PX, Piece, match_pieces
-from measure.tie_points.tracks import find_candidates, neighbour_outliers, tracks_of_pairs, verify_pairs
+from measure.tie_points.tracks import (
+    Features,
+    TieFrame,
+    find_candidates,
+    neighbour_outliers,
+    tracks_of_pairs,
+    verify_pairs,
+)
 
 Array = NDArray[np.float64]
 

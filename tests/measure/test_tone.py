@@ -25,8 +25,7 @@ from measure.fiducials.measure_frame import Frame, measure_frame, shift_to_curve
 from measure.flags import Cause
 from measure.scans.jpeg import covariance_of_compression, quantisation_step_dn
 from measure.scans.opening import crop_scan, declared_tone
-from measure.tone.curve import LINEAR, Tone, ToneInformation, power, sampled_curve, srgb
-from measure.tone.declared import curve_of_profile
+from measure.tone.curve import LINEAR, Tone, ToneInformation, curve_of_profile, power, sampled_curve, srgb
 from measure.tone.estimate import FrameTone, MarkTone, tone_score
 from measure.tone.sharpening import Sharpening, SharpeningScore, estimate_sharpening
 from synthetic_images.tone_curve import coded

@@ -22,9 +22,9 @@ from adjust.functional_model.transformation import Film as OtherFilm
 from measure import MarkMeasurement, Status
 from measure.flags import Code, Reason
 from measure.results import Covariance, FrameMeasurement
-from measure.tie_points.features import TieFrame
 from measure.tie_points.find_points import TieOptions, measure_ties
 from measure.tie_points.joins import measure_joins
+from measure.tie_points.tracks import TieFrame
 from pipeline import InputError, build_network, read_images, read_measurement, read_project
 from pipeline.archive.verdicts import Verdict, scan_verdict
 from pipeline.blocks import block_stage
