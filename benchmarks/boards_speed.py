@@ -25,7 +25,7 @@ from measure.boards.measure import measure_board
 from measure.boards.specs import ChessboardSpec, CircleGridSpec
 from measure.scans.opening import open_scan
 from pipeline.calibration.calibrate_stage import calibrate
-from pipeline.progress import Reporter, TimedCount
+from pipeline.terminal import Reporter, TimedCount
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]

@@ -28,7 +28,7 @@ from measure.boards.specs import (
 from measure.scans.cache import WholePicture
 from measure.scans.metadata import Pitch
 from measure.scans.scan import Scan
-from pipeline.opencv_check.board_corners import find_points
+from pipeline.opencv_check.check import find_points
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]

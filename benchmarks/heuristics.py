@@ -13,7 +13,7 @@ from true_marks import KIND
 
 import measure.fiducials.measure_frame as frame_measurement
 import measure.targets.identification as targets
-from adjust.linear_algebra import fronts
+from adjust.linear_algebra import sparse_factor
 from adjust.solution.adjustment import adjust
 from benchmarks.dusty_marks import frame_of_disks
 from benchmarks.faint_marks import drawn_frame, measured_faint
@@ -65,7 +65,7 @@ Study = Callable[[int], str]
 SWITCHED: dict[str, tuple[Study, Any, str, Any]] = {
     "faint marks": (faint, frame_measurement, "detect_faint_marks", lambda frame, _reach_px: frame),
     "dusty disks": (dusty_disks, targets, "dust_reasons", _lone),
-    "fronts": (one_front, fronts, "FRONT_COST", 1e30),
+    "fronts": (one_front, sparse_factor, "FRONT_COST", 1e30),
 }
 
 

@@ -20,7 +20,7 @@ from benchmarks.harness import DATA
 from measure.boards.measure import measure_board, one_definition
 from measure.boards.specs import BoardSpec, ChessboardSpec, CircleGridSpec
 from measure.scans.opening import open_scan
-from pipeline.opencv_check.board_corners import CRITERIA, FLAGS, NEAREST
+from pipeline.opencv_check.check import CRITERIA, FLAGS, NEAREST
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]

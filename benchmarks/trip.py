@@ -66,8 +66,8 @@ def followed() -> Followed:
     from pipeline.archive import measure_archive
     from pipeline.archive.results_database import ResultsDatabase
     from pipeline.files.project_file import read_project
-    from pipeline.progress import Reporter
     from pipeline.results.comparator_file import write_comparator
+    from pipeline.terminal import Reporter
     from pipeline.workers import WorkOptions
 
     with TemporaryDirectory() as place:

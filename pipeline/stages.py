@@ -24,7 +24,6 @@ from pipeline.archive.verdicts import Verdict
 from pipeline.errors import InputError, WriteError
 from pipeline.files.object_files import WRITTEN, fill_images
 from pipeline.files.project_file import Project
-from pipeline.progress import Reporter
 from pipeline.provenance import hash_file
 from pipeline.publishing import Unpublished, unpublished
 from pipeline.report.data import ReportData
@@ -35,6 +34,7 @@ from pipeline.results.adjustment_file import covariance_path, read_adjustment, w
 from pipeline.results.measured_record import MeasuredScan, for_images, write_frames
 from pipeline.results.record_json import write_record
 from pipeline.summary import Summary, archive_summary, summarise
+from pipeline.terminal import Reporter
 from pipeline.workers import NotMeasured, WorkOptions
 
 _ONE_BY_ONE = 2000  # scans; for more, the summary is read from the database: totals and what needs a look
@@ -306,8 +306,7 @@ class _Run:
         write_adjustment(adjustment, path, adjusted_from(project, marks), frames_mm)
 
     def write_check(self, adjustment: Adjustment) -> None:
-        from pipeline.opencv_check.board_corners import BoardPictures, detector_name
-        from pipeline.opencv_check.check import check_against_opencv
+        from pipeline.opencv_check.check import BoardPictures, check_against_opencv, detector_name
 
         project, path, pictures = self.project, self.project.adjustment_path, None
         board = project.targets.board if project.targets else None

@@ -12,12 +12,11 @@ from reference_cases import CASES, case_approximations, case_network, load
 
 import compiled
 from adjust.functional_model.projection import LineOfSight
-from adjust.linear_algebra import elimination, fronts
+from adjust.linear_algebra import elimination, sparse_factor
 from adjust.linear_algebra.elimination import SparseBlocks, eliminate_blocks
 from adjust.linear_algebra.factor import Blocks
-from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.normal_equations import SharedEquations, SparseRows, SparsityPattern
-from adjust.linear_algebra.sparse_factor import Triangle
+from adjust.linear_algebra.sparse_factor import Fronts, Triangle
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
 from measure.marks import rendering
@@ -231,7 +230,7 @@ def test_networks_are_the_same_by_both(count: int, bent: bool, monkeypatch: pyte
     if bent:
         network = replace(network, line_of_sight=LineOfSight(curvature=True))
     monkeypatch.setattr(elimination, "CHEAP", 0.0)
-    monkeypatch.setattr(fronts, "FRONT_COST", 1e3)
+    monkeypatch.setattr(sparse_factor, "FRONT_COST", 1e3)
     found = adjust(network, start)
     monkeypatch.setattr(compiled, "kernels", None)
     assert_alike(found, adjust(network, start))

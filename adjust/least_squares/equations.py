@@ -16,10 +16,9 @@ from scipy.sparse import csr_array
 import compiled
 from adjust.array_types import Array, Indices
 from adjust.linear_algebra.factor import Blocks
-from adjust.linear_algebra.fronts import Fronts, band_order, make_fronts
 from adjust.linear_algebra.normal_equations import SparseRows, SparsityPattern
 from adjust.linear_algebra.small_matrices import applied, inverse, lower_root, product
-from adjust.linear_algebra.sparse_factor import ELEMENTS_AT_ONCE
+from adjust.linear_algebra.sparse_factor import ELEMENTS_AT_ONCE, Fronts, band_order, make_fronts
 from adjust.problem.condition_equations import Derivatives
 from adjust.problem.problem import ABSENT, Problem, State, side_by_side
 

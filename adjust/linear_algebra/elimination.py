@@ -25,11 +25,11 @@ from scipy.sparse import bsr_array, coo_array, csr_array
 import compiled
 from adjust.array_types import Array, Indices
 from adjust.linear_algebra.factor import BlockFactors, Blocks, DenseBlocks, Factor, column_values
-from adjust.linear_algebra.fronts import Fronts
 from adjust.linear_algebra.normal_equations import SharedEquations, SparseRows, SparsityPattern, batches, take_columns
 from adjust.linear_algebra.sparse_factor import (
     SAFE,
     TEN_DIGITS,
+    Fronts,
     Triangle,
     factorise_normal_equations,
     qr_triangle,

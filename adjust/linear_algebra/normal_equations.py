@@ -10,7 +10,7 @@ from scipy.sparse import coo_array, csr_array
 import compiled
 from adjust.array_types import Array, Indices
 from adjust.linear_algebra.factor import Blocks
-from adjust.linear_algebra.fronts import Fronts
+from adjust.linear_algebra.sparse_factor import Fronts
 
 Arranged = Callable[[], Iterable[tuple[Indices, Blocks]]]  # pairs of rows (b, m), and their dense blocks of equal shape
 ROWS_AT_ONCE = 20_000  # pairs of rows in one batch, which then fits the processor's cache

@@ -26,9 +26,8 @@ from adjust.problem.problem import Problem, number_reduced
 from adjust.problem.unknowns import Reduction
 from adjust.quality.variance_components import added_variance
 from adjust.rank_defect.datum import held_as_known
-from adjust.solution.blunder_hypotheses import Trials, blunder_sentence
+from adjust.solution.blunder_hypotheses import Trials, blunder_sentence, frame_cause
 from adjust.solution.coordinate_blunders import CoordinateBlunder, find_coordinate_blunders
-from adjust.solution.frame_hypotheses import frame_cause
 from adjust.solution.given_orientations import orientations_elsewhere, unlike_approximations
 from adjust.solution.options import Datum, Method, Options
 from adjust.solution.plausibility import check_plausibility

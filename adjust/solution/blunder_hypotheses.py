@@ -2,6 +2,10 @@
 
 Mirrored points or exchanged axes, another unit, y pointing down, exchanged frames, mirrored images, a wrong principal
 distance. Such a blunder leaves residuals everywhere, and tests of single observations would reject good ones.
+
+Of one frame that contradicts the others as a whole the names of its fiducials, its film and its camera are tested, each
+in the adjustment of all frames. Of those with which all observations agree, the one with the smallest v'Pv plus twice
+the unknowns is told (Akaike).
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -14,10 +18,10 @@ from scipy.special import chdtrc
 
 from adjust.array_types import Array
 from adjust.functional_model.families import family
-from adjust.functional_model.lens import Distortion, Prior
+from adjust.functional_model.lens import INTERIOR_NAMES, Distortion, Prior
 from adjust.functional_model.opencv_family import FISHEYE_NAMES
 from adjust.problem.network import Network, ObjectPoint
-from adjust.problem.parameter import shortened
+from adjust.problem.parameter import Parameter, shortened
 from adjust.solution.explanations import CHECKED
 from adjust.solution.given_orientations import (
     AXES,
@@ -32,8 +36,16 @@ from adjust.solution.given_orientations import (
     times_too,
     wrong_orientations,
 )
+from adjust.solution.model_hypotheses import OTHERS, RICHER, Estimate, group_words
 from adjust.solution.result import Adjustment
-from adjust.solution.wrong_names import LARGE, NAMED, points_with_scaled_heights, transformed_fields
+from adjust.solution.wrong_names import (
+    LARGE,
+    NAMED,
+    points_with_scaled_heights,
+    renamed_words,
+    transformed_fields,
+    turned_layouts,
+)
 
 WORST, RARE = 3, 1e-3  # frames of a camera tried with another one; ratio of likelihoods to be exceeded by one trial
 MOST_PAIRS = 15  # pairs of frames tried as exchanged, largest residuals first
@@ -411,3 +423,70 @@ def _found_distance(camera: str, given_mm: float, found: Adjustment) -> str:
     is_unit = any(abs(times / each - 1.0) < ROUND for each in PITCHES)
     why = f", so that it is given {times:.3g} times too {how}: another unit, or a wrong pitch_um" if is_unit else ""
     return f": it is found as {c:.6g} mm{why}"
+
+
+def frame_cause(network: Network, frame: str, rest: Adjustment, trials: Trials) -> str:
+    """Describe what is wrong with a frame by the best hypothesis with which all agree; empty where there is none.
+
+    rest: adjustment without it.
+    """
+    found = list[tuple[float, str]]()
+    for words, changed in _frame_hypotheses(network, frame, rest):
+        result = trials.adjust(changed)
+        if result is not None and result.converged and trials.explains(result):
+            criterion = result.vpv + 2.0 * result.unknowns
+            found.append((criterion, words or _interior_words(result, frame)))
+    return min(found, default=(0.0, ""))[1]
+
+
+def _frame_hypotheses(network: Network, frame: str, rest: Adjustment) -> Iterator[tuple[str, Network]]:
+    """Generate words and networks; a frame with an interior orientation of its own has its words from the adjustment.
+
+    A frame that was scanned in parts has none.
+    """
+    (image, *parts) = (each for each in network.images if each.frame == frame)
+    if parts:
+        return
+    camera, observations = network.camera_by_name[image.camera], network.observations
+    own = (np.array(observations.image) == image.name) & observations.is_fiducial
+    shown = sorted({observations.point[row] for row in np.flatnonzero(own)})
+    for renamed in turned_layouts({name: camera.fiducials[name] for name in shown}):
+        rows = zip(observations.point, own, strict=True)
+        point = tuple(renamed.get(name, name) if is_own else name for name, is_own in rows)
+        yield (
+            f"the fiducials of image {frame} have each other's names: {renamed_words(renamed)}. Correct the names.",
+            replace(network, observations=replace(observations, point=point)),
+        )
+    for kind in RICHER.get(image.transformation, ()):
+        images = tuple(replace(each, transformation=kind) if each is image else each for each in network.images)
+        yield (
+            f"the film of image {frame} is deformed by more than its transformation ({image.transformation}) models; "
+            f"with {kind} all agree. Look for stretched or torn film, and scan it again.",
+            replace(network, images=images),
+        )
+
+    def estimated(quantity: str, sigma: float = 0.0) -> Prior:
+        return Prior(rest.value(Parameter.interior(camera.name, quantity)), sigma)
+
+    lens = replace(camera.distortion, parameters={name: estimated(name) for name in camera.distortion.parameters})
+    other = replace(
+        camera,
+        name=f"{camera.name}{OTHERS}",
+        principal_distance_mm=estimated("c", np.inf),
+        x0_mm=None,
+        y0_mm=None,
+        distortion=lens,
+    )
+    images = tuple(replace(each, camera=other.name) if each is image else each for each in network.images)
+    yield "", replace(network, images=images, cameras=(*network.cameras, other))
+
+
+def _interior_words(result: Adjustment, frame: str) -> str:
+    """Describe a frame by an interior orientation of its own."""
+    other = next(image.camera for image in result.network.images if image.frame == frame)
+    cameras = (other, other.removesuffix(OTHERS))
+    names = [Parameter.interior(name, quantity) for name in cameras for quantity in INTERIOR_NAMES]
+    covariance = result.sigma0**2 * result.cofactor_of(names)
+    estimate = Estimate(result.values_of(names), np.sqrt(np.diag(covariance)), covariance)
+    cause, remedy = group_words(f"the marks of image {frame}", estimate)
+    return f"{cause[0].lower()}{cause[1:]}. {remedy}"

@@ -28,12 +28,11 @@ from pipeline.errors import InputError
 from pipeline.files.project_file import ASSUMED_PITCH_UM, Project
 from pipeline.files.project_tables import AdjustSettings
 from pipeline.measuring import target_field
-from pipeline.progress import Reporter
 from pipeline.publishing import unpublished
 from pipeline.results.comparator_file import ComparatorPoint, has_pixels_alone, read_comparator
 from pipeline.results.record_json import write_record
 from pipeline.results.stage_files import choice_content
-from pipeline.terminal import uncut_table
+from pipeline.terminal import Reporter, uncut_table
 from pipeline.text.wording import listed
 from pipeline.types import Array
 

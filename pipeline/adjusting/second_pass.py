@@ -19,8 +19,8 @@ from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
 from pipeline.measuring.target_field import TargetField, checked_places, measure_single_targets, target_field
 from pipeline.measuring.target_stage import replace_targets
-from pipeline.progress import Reporter
 from pipeline.results.measured_record import MeasuredScan
+from pipeline.terminal import Reporter
 from pipeline.workers import iterate_results
 
 _SEARCH_PX = 2.0  # search radius: predictions of an adjusted orientation are far more precise

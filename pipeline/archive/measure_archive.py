@@ -22,8 +22,8 @@ from pipeline.measuring.learn_stage import collect_tones, learn_marks
 from pipeline.measuring.roll import add_known_lines
 from pipeline.measuring.scan_task import ScanTask, scan_tasks
 from pipeline.measuring.tie_stage import check_tie_names, tie_scans
-from pipeline.progress import Reporter
 from pipeline.provenance import FileIdentity, FileStates, content_hash, parts_hash, shard_number
+from pipeline.terminal import Reporter
 from pipeline.text.wording import counted, gathered
 from pipeline.workers import WorkOptions, cluster_executor, worker_pool
 

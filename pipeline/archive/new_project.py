@@ -18,7 +18,7 @@ from pipeline.archive import scan_groups
 from pipeline.errors import InputError
 from pipeline.files.camera_file import read_camera
 from pipeline.files.library import PREFIX, library_path, read_library
-from pipeline.progress import Reporter
+from pipeline.terminal import Reporter
 from pipeline.text.csv_table import csv_line
 from pipeline.text.files import check_writable, image_name, names_below, split_lines, write_atomically
 from pipeline.text.wording import count_sentence, counted, listed, quoted

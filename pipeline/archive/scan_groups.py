@@ -25,8 +25,8 @@ from pipeline.files.library import library_names, library_path
 from pipeline.files.scan_files import each_once, folders_below
 from pipeline.measuring.camera_identification import Identification
 from pipeline.measuring.camera_trials import identify
-from pipeline.progress import Count, Reporter
 from pipeline.provenance import alike_groups, content_hash, parts_hash
+from pipeline.terminal import Count, Reporter
 from pipeline.text.files import SCAN_ENDINGS
 from pipeline.text.wording import counted
 

@@ -21,9 +21,9 @@ from pipeline.files.decisions_file import About, Decision
 from pipeline.files.project_file import Project
 from pipeline.measuring.scan_measurement import MeasuredFile, ended_scan, measure_file, reads_writing
 from pipeline.measuring.scan_task import ScanTask
-from pipeline.progress import Reporter
 from pipeline.provenance import FileIdentity, FileState, FileStates, hash_text, parts_hash, result_key
 from pipeline.results.measured_record import MeasuredScan
+from pipeline.terminal import Reporter
 from pipeline.text.wording import count_sentence, counted, drop_file_name, listed
 from pipeline.types import Array
 from pipeline.workers import TASKS_A_CORE, NotMeasured, WorkOptions, iterate_results

@@ -33,7 +33,6 @@ from pipeline.exchange.pinhole import COLMAP, import_pycolmap
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.object_files import ELEMENTS, SIGMAS, GivenImages
 from pipeline.files.project_file import Project
-from pipeline.progress import Reporter
 from pipeline.resampling.canvas import Canvas, FrameChain
 from pipeline.resampling.resample_stage import FAST, ResampleTask, read_description, resample, resample_tasks
 from pipeline.results.comparator_file import (
@@ -44,6 +43,7 @@ from pipeline.results.comparator_file import (
     read_pitches,
     write_comparator,
 )
+from pipeline.terminal import Reporter
 from pipeline.text.csv_table import csv_line
 from pipeline.text.files import file_word, path_below, write_atomically
 from pipeline.text.wording import counted, listed_by_reason

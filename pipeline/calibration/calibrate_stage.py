@@ -44,11 +44,11 @@ from pipeline.calibration.pictures import (
 )
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
-from pipeline.progress import Reporter
 from pipeline.results.comparator_file import ComparatorPoint, read_comparator
 from pipeline.results.stage_files import read_check
 from pipeline.stages import run_all, run_measure
 from pipeline.summary import Summary
+from pipeline.terminal import Reporter
 from pipeline.text.files import FilePath, write_atomically
 from pipeline.text.wording import counted, did_you_mean, listed, listed_by_reason
 from pipeline.workers import WorkOptions

@@ -28,7 +28,7 @@ def check(project: shared.ProjectFile, as_json: shared.AsJson = False) -> int:
 def choose(project: shared.ProjectFile, as_json: shared.AsJson = False) -> int:
     """Select lens and film models by tests and cross-validation."""
     from pipeline.adjusting.adjust_stage import print_choice, run_choose
-    from pipeline.progress import Reporter
+    from pipeline.terminal import Reporter
 
     settings = shared.read(project)
     choice, record = run_choose(settings, Reporter())
@@ -48,8 +48,8 @@ def block(
 ) -> int:
     """Orient overlapping frames by COLMAP, and adjust them."""
     from pipeline.blocks.block_stage import run_block
-    from pipeline.progress import Reporter
     from pipeline.stages import run_adjust
+    from pipeline.terminal import Reporter
 
     reporter = Reporter()
     oriented, left_out, lines = run_block(shared.read(project, max_pixels), out_dir, pitch_um, reporter)
@@ -109,7 +109,7 @@ def design(
 ) -> int:
     """Expected precision of planned photographs."""
     from pipeline.design.summary import print_design, run_design
-    from pipeline.progress import Reporter
+    from pipeline.terminal import Reporter
 
     planned = run_design(scene, out_dir, Reporter())
     shared.show(as_json, planned.content, lambda console: print_design(planned, console))

@@ -27,8 +27,8 @@ def resample(
     as_json: shared.AsJson = False,
 ) -> int:
     """Rectify scans into the camera frame."""
-    from pipeline.progress import Reporter
     from pipeline.resampling.resample_stage import Resampled, resample, resampled_json
+    from pipeline.terminal import Reporter
 
     def line(result: Resampled) -> str:
         outcome = result.problem or f"{result.width_px} x {result.height_px} px{', as it was' if result.kept else ''}"
@@ -144,8 +144,8 @@ def convert(
 
 def render(scene: shared.SceneFile, out_dir: shared.OutDir) -> int:
     """Render synthetic scans with their truth."""
-    from pipeline.progress import Reporter
     from pipeline.rendered.scene_file import render_project
+    from pipeline.terminal import Reporter
 
     with Reporter().stage("rendering strip") as count:
         render_project(scene, out_dir, count)

@@ -36,9 +36,9 @@ def demo(
 ) -> int:
     """Render five film frames and run everything on them."""
     from pipeline.files.project_file import read_project
-    from pipeline.progress import Reporter
     from pipeline.rendered.scene_file import TRUTH, render_project
     from pipeline.stages import run_all
+    from pipeline.terminal import Reporter
 
     make_folder(folder)
     if any(folder.iterdir()) and not (folder / TRUTH).exists():
@@ -67,7 +67,7 @@ def init(
     """Write a project for a folder of scans, cameras named."""
     from measure.scans.remote import scan_path
     from pipeline.archive.new_project import init_project, print_new_project
-    from pipeline.progress import Reporter
+    from pipeline.terminal import Reporter
 
     new = init_project([scan_path(text) for text in scans], out, Reporter(quiet=quiet), max_pixels)
     shared.show(as_json, new.as_json, lambda console: print_new_project(new, console))
@@ -115,9 +115,9 @@ def run(
 
     Goes on where an earlier call stopped. A folder of film scans without a project gets one first, as by `reseau init`.
     """
-    from pipeline.progress import Reporter
     from pipeline.stages import run_all
     from pipeline.summary import print_summary
+    from pipeline.terminal import Reporter
     from pipeline.workers import WorkOptions
 
     work, reporter = WorkOptions(_shard(shard), cluster, retry, moved, workers), Reporter(quiet=quiet)
@@ -201,8 +201,8 @@ def merge(
     as_json: shared.AsJson = False,
 ) -> int:
     """Join the results of several machines."""
-    from pipeline.progress import Reporter
     from pipeline.stages import run_merge
+    from pipeline.terminal import Reporter
 
     taken, summary = run_merge(shared.read(project), databases, Reporter())
     if not as_json:
@@ -227,8 +227,8 @@ def report(
     max_pixels: shared.MaxPixels = None,
 ) -> int:
     """Write report.html, or a page of single frames."""
-    from pipeline.progress import Reporter
     from pipeline.stages import run_frame_pages, run_plots, run_report
+    from pipeline.terminal import Reporter
 
     if plots is not None:
         run_plots(shared.read(project, max_pixels), plots, Reporter())
@@ -357,7 +357,7 @@ def _name_cameras(
     from pipeline.files.library import PREFIX, read_library
     from pipeline.measuring.camera_identification import print_identification
     from pipeline.measuring.camera_trials import identify
-    from pipeline.progress import Reporter
+    from pipeline.terminal import Reporter
 
     own = {name: camera for name, camera in project.cameras.items() if PREFIX not in name} if project else {}
     tried, reporter = {**own, **read_library()}, Reporter()

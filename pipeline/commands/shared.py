@@ -20,8 +20,8 @@ from pipeline.text.wording import counted
 if TYPE_CHECKING:
     from pipeline.archive.new_project import NewProject
     from pipeline.files.project_file import Project
-    from pipeline.progress import Reporter
     from pipeline.summary import Summary
+    from pipeline.terminal import Reporter
 
 DONE, LOOK, WRONG_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 130
 MOST = 3  # suggested next steps: the most urgent first
@@ -61,7 +61,7 @@ def run_stage(
     quiet: bool = False,
 ) -> int:
     """Run a stage on a project and print its summary. Returns the exit code."""
-    from pipeline.progress import Reporter
+    from pipeline.terminal import Reporter
 
     return finish(stage(read(path, max_pixels), Reporter(quiet=quiet)), as_json, path)
 

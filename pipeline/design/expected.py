@@ -21,7 +21,7 @@ from adjust.solution.adjustment import Options
 from adjust.solution.planning import Plan, plan
 from pipeline.adjusting.network import FEWEST_TARGETS
 from pipeline.design.setup import Setup, planned_network
-from pipeline.progress import Count
+from pipeline.terminal import Count
 from pipeline.types import Array
 from synthetic_images.scene import SceneImage
 

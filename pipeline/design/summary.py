@@ -24,10 +24,9 @@ from pipeline.design.expected import (
 )
 from pipeline.design.sweeps import Swept, Variations, over_layouts, sweep
 from pipeline.drawing import svg
-from pipeline.progress import Reporter
 from pipeline.report.numbers import NONE, fixed, significant, typed, value_and_sigma
 from pipeline.results.record_json import write_record
-from pipeline.terminal import uncut_table
+from pipeline.terminal import Reporter, uncut_table
 from pipeline.text.files import FORMS, check_replaceable, check_writable
 
 WIDE_RANGE = 2.0  # ratio of the largest to the smallest value, from which the axis is logarithmic

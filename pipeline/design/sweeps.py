@@ -14,9 +14,9 @@ from pipeline.design.setup import Setup, scene_setup
 from pipeline.errors import InputError
 from pipeline.files.library import camera_path
 from pipeline.files.object_files import ELEMENTS
-from pipeline.progress import Count
 from pipeline.rendered.scene_file import parse_scene
 from pipeline.rendered.scene_tables import Sweep
+from pipeline.terminal import Count
 from pipeline.text.toml_tables import Table, read_toml
 from pipeline.text.wording import did_you_mean
 

@@ -31,7 +31,7 @@ from pipeline.measuring.camera_identification import (
     is_whole_plate,
     parse_plate,
 )
-from pipeline.progress import Count, Reporter
+from pipeline.terminal import Count, Reporter
 from pipeline.types import Array
 
 _LEAST_DETAIL_PX = 0.25  # width of the finest detail of marks below which nothing in a picture is one of them

@@ -29,8 +29,14 @@ from pipeline.errors import InputError
 from pipeline.files.camera_file import CameraFile
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
-from pipeline.measuring.target_field import TargetField, absent_targets, checked_places
-from pipeline.measuring.target_identification import NamedField, camera_model, name_field
+from pipeline.measuring.target_field import (
+    NamedField,
+    TargetField,
+    absent_targets,
+    camera_model,
+    checked_places,
+    name_field,
+)
 from pipeline.results.measured_record import MeasuredScan
 from pipeline.text.wording import did_you_mean, listed
 from pipeline.types import Array

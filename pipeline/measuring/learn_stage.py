@@ -25,9 +25,9 @@ from pipeline.files.mark_table import picture_writer
 from pipeline.files.project_file import Project
 from pipeline.measuring.first_pictures import first_pictures
 from pipeline.measuring.scan_task import Measure, Memory, ScanTask, sample_names, scan_tasks
-from pipeline.progress import Reporter
 from pipeline.provenance import content_hash, fingerprint, hash_content, hash_file
 from pipeline.results.measured_record import plain_json, read_plain
+from pipeline.terminal import Reporter
 from pipeline.text.files import write_atomically
 
 _SAMPLES = 8  # scans of a scanner from which its curve is estimated

@@ -18,8 +18,8 @@ from measure.marks.shapes import WrittenPlace
 from measure.results import FrameMeasurement, ScanOrientation
 from pipeline.files.camera_file import CameraFile
 from pipeline.measuring.scan_task import Measure, ScanOptions, ScanTask, sample_names
-from pipeline.progress import Reporter
 from pipeline.results.measured_record import MeasuredScan, unique_fields
+from pipeline.terminal import Reporter
 
 _ONE_QUESTION = (
     "the frames are named so that what is written lies alike in all of the camera whose writing was read; nothing says "

@@ -19,7 +19,7 @@ from pipeline.files.project_file import Project
 from pipeline.files.target_table import TargetSettings
 from pipeline.measuring import target_field
 from pipeline.measuring.coded_targets import CodedPoints, measure_coded_field, measure_sheet
-from pipeline.measuring.target_identification import (
+from pipeline.measuring.target_field import (
     NamedField,
     camera_model,
     name_field,

@@ -18,8 +18,8 @@ from pipeline.errors import InputError
 from pipeline.files.project_file import Project
 from pipeline.files.target_table import TieSettings
 from pipeline.measuring.coded_targets import check_sheet
-from pipeline.progress import Count, Reporter
 from pipeline.results.measured_record import MeasuredScan
+from pipeline.terminal import Count, Reporter
 from pipeline.text.wording import capitalised
 from pipeline.types import Array
 

@@ -34,12 +34,12 @@ from pipeline.archive.made_from import changed_scans, current_adjustment
 from pipeline.archive.verdicts import Verdict, has_problem, scan_doubt, scan_verdict
 from pipeline.errors import InputError
 from pipeline.files.project_file import Project
-from pipeline.progress import Reporter
 from pipeline.provenance import file_state, fingerprint
 from pipeline.resampling import canvas as frame_canvas
 from pipeline.results.adjustment_record import AdjustmentRecord
 from pipeline.results.comparator_file import read_comparator
 from pipeline.results.measured_record import MeasuredScan
+from pipeline.terminal import Reporter
 from pipeline.text.files import atomic_path, check_writable, path_below
 from pipeline.types import Array, Mask, Samples
 from pipeline.workers import WorkerKilled, worker_pool

@@ -18,9 +18,8 @@ from adjust.functional_model.rotation import rotation_from_angles
 from adjust.problem.problem import number_reduced
 from adjust.quality.critical_values import Probabilities
 from adjust.solution.adjustment import _is_of_single_marks, _Solver, adjust_unmodelled
-from adjust.solution.blunder_hypotheses import network_hypotheses
+from adjust.solution.blunder_hypotheses import frame_cause, network_hypotheses
 from adjust.solution.explanations import explain
-from adjust.solution.frame_hypotheses import frame_cause
 from adjust.solution.model_hypotheses import film_deformations, model_hypotheses
 from adjust.solution.result import adjust_problem
 from adjust.solution.wrong_names import points_with_scaled_heights

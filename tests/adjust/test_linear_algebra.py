@@ -15,10 +15,10 @@ from scipy.sparse.linalg import splu
 from adjust import Approximations, Network, adjust
 from adjust.least_squares.equations import Numbering, WhitenedRows, prior_root_weights
 from adjust.least_squares.iteration import Linearised, factorise, linearise
-from adjust.linear_algebra import elimination, fronts, sparse_factor
+from adjust.linear_algebra import elimination, sparse_factor
 from adjust.linear_algebra.elimination import eliminate
 from adjust.linear_algebra.factor import Blocks, Factor
-from adjust.linear_algebra.fronts import make_fronts
+from adjust.linear_algebra.sparse_factor import make_fronts
 from adjust.problem.problem import number
 
 Array = NDArray[np.float64]
@@ -172,7 +172,7 @@ LENGTH = 14
 @pytest.fixture
 def finely(monkeypatch: pytest.MonkeyPatch) -> None:
     """As many fronts as an image each, however small the network."""
-    monkeypatch.setattr(fronts, "FRONT_COST", 0.0)
+    monkeypatch.setattr(sparse_factor, "FRONT_COST", 0.0)
 
 
 def strip(sigma: float) -> tuple[Network, Approximations]:

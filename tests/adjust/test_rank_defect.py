@@ -14,8 +14,7 @@ from reference_cases import CAUSES, DROPPED, Case, case_approximations, case_net
 
 from adjust import Adjustment, AdjustmentError
 from adjust.linear_algebra.factor import BlockFactors, DenseBlocks, Factor
-from adjust.linear_algebra.fronts import Fronts
-from adjust.linear_algebra.sparse_factor import Triangle
+from adjust.linear_algebra.sparse_factor import Fronts, Triangle
 from adjust.problem.network import Network, Transformation
 from adjust.problem.problem import number
 from adjust.rank_defect import diagnosis

@@ -44,7 +44,7 @@ from pipeline.calibration.project_files import CalibrationOptions, board_options
 from pipeline.files.project_file import Project
 from pipeline.files.project_tables import AdjustSettings
 from pipeline.files.target_table import read_targets
-from pipeline.opencv_check.board_corners import BoardPictures, compare_corners, detector_name, find_points
+from pipeline.opencv_check.check import BoardPictures, compare_corners, detector_name, find_points
 from pipeline.opencv_check.opencv_calibration import NAMES, Freedom, OpenCvCalibration, OpenCVPoints, calibrate
 from pipeline.results.comparator_file import ComparatorPoint
 from pipeline.results.measured_record import MeasuredScan

@@ -35,10 +35,9 @@ from pipeline.cli import app
 from pipeline.commands.shared import command_step, print_next, summary_steps
 from pipeline.errors import InputError
 from pipeline.exchange.exchange_stage import check_folder
-from pipeline.progress import Reporter, time_left
 from pipeline.report.verdict import ReportVerdict
 from pipeline.summary import Summary
-from pipeline.terminal import PlainConsole, uncut_table
+from pipeline.terminal import PlainConsole, Reporter, time_left, uncut_table
 from pipeline.text.wording import count_sentence
 
 
@@ -357,7 +356,7 @@ def lines(quiet: bool = False, terminal: bool = False) -> list[str]:
 def test_the_time_left_is_estimated_from_the_second_item_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """Thirty seconds an item; the first also loads what all need."""
     text, seconds = io.StringIO(), itertools.count(0.0, 30.0)
-    monkeypatch.setattr("pipeline.progress.time.monotonic", lambda: next(seconds))
+    monkeypatch.setattr("pipeline.terminal.time.monotonic", lambda: next(seconds))
     with Reporter(PlainConsole(file=text, width=200)).stage("reading scan") as count:
         for done, name in enumerate(("a", "b"), 1):
             count(name, done, 6)

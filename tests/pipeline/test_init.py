@@ -39,8 +39,8 @@ from pipeline.files.camera_file import CameraFile, read_camera
 from pipeline.files.library import library_names, library_path, read_library
 from pipeline.measuring.camera_identification import Identification, Trial, drawn_alike
 from pipeline.measuring.camera_trials import _alike, _attempts, _trials, identify
-from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import render_project
+from pipeline.terminal import Reporter
 
 RNG = np.random.default_rng(9)
 REPORTS = {name: camera.source.reports for name, camera in read_library().items() if camera.source}

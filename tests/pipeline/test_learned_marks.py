@@ -22,7 +22,7 @@ from pipeline.measuring import learn_stage
 from pipeline.measuring.learn_stage import learn_marks
 from pipeline.measuring.scan_measurement import measured_scan
 from pipeline.measuring.scan_task import scan_tasks
-from pipeline.progress import Reporter
+from pipeline.terminal import Reporter
 from synthetic_images import areas, scene
 from synthetic_images.render import render_scene
 

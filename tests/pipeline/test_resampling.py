@@ -23,7 +23,6 @@ from adjust.functional_model.transformation import Film
 from measure import MeasurementError, ScanOrientation, open_scan
 from measure.flags import Code, Reason
 from pipeline.files.project_file import read_project
-from pipeline.progress import Reporter
 from pipeline.resampling.canvas import Canvas, FrameChain, outline_canvas, scan_places
 from pipeline.resampling.resample_stage import (
     BEST,
@@ -38,6 +37,7 @@ from pipeline.resampling.resample_stage import (
     resample_frame,
     resample_tasks,
 )
+from pipeline.terminal import Reporter
 from pipeline.workers import WorkerKilled
 
 Array = NDArray[np.float64]

@@ -25,8 +25,7 @@ from pipeline import InputError
 from pipeline.files.project_file import Project, read_project
 from pipeline.measuring.coded_targets import check_sheet
 from pipeline.measuring.scan_task import scan_tasks
-from pipeline.measuring.target_field import across, disk_images, disk_normals, eccentricity_mm, plane_normal
-from pipeline.measuring.target_identification import recognise
+from pipeline.measuring.target_field import across, disk_images, disk_normals, eccentricity_mm, plane_normal, recognise
 from pipeline.rendered.scene_file import render_project
 from pipeline.results.comparator_file import pixel_from_comparator
 from pipeline.results.measured_record import MeasuredScan

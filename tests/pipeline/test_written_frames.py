@@ -34,10 +34,10 @@ from pipeline.measuring.camera_identification import (
 )
 from pipeline.measuring.roll import add_known_lines, known_lines, note_same_frames, poses_of_roll
 from pipeline.measuring.scan_task import ScanOptions, ScanTask
-from pipeline.progress import Reporter
 from pipeline.rendered.scene_file import render_project
 from pipeline.report.frame_views import writing_picture
 from pipeline.results.measured_record import MeasuredScan, for_images, write_frames
+from pipeline.terminal import Reporter
 from pipeline.text.toml_tables import Table
 
 WILD = (WrittenPlace("left", "90"), WrittenPlace("right", "270", plate=True))
