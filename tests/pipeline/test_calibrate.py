@@ -720,9 +720,16 @@ def test_a_fisheye_is_taken_where_the_first_lens_does_not_suit_at_all(
 
 @pytest.mark.parametrize(("count", "better"), [(3, False), (12, True)])
 def test_few_pictures_need_a_larger_gain(count: int, better: bool) -> None:
-    """Gains of -0.5, 1 and 2 are 1.15 standard errors of three pictures (1.32 needed), 2.6 of twelve."""
-    richer, simpler = ({f"i{k}": each[k % 3] for k in range(count)} for each in ((0.0,) * 3, (-0.5, 1.0, 2.0)))
+    """Logarithms that fall by -0.5, 1 and 2 do by 1.15 standard errors of three (1.32 needed), 2.6 of twelve."""
+    richer, simpler = ({f"i{k}": np.exp(each[k % 3]) for k in range(count)} for each in ((0.0,) * 3, (-0.5, 1.0, 2.0)))
     assert intrinsics._is_better(richer, simpler) == better
+
+
+def test_a_lens_that_suits_every_picture_is_better_though_errors_differ_a_thousandfold() -> None:
+    """Mean difference of 98 with a standard error of 91; the smallest ratio is 180."""
+    assert intrinsics._is_better(
+        dict.fromkeys("abcde", 0.005), dict(zip("abcde", (2.9, 1.1, 0.9, 460.0, 25.0), strict=True))
+    )
 
 
 @pytest.mark.parametrize(
