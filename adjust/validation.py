@@ -71,7 +71,7 @@ def _name_faults(network: Network) -> Faults:
 
 
 def _camera_faults(network: Network) -> Faults:
-    """Faults of cameras, and of images with an unknown camera or scanner, or with a fixed antenna station."""
+    """Faults of cameras, and of images with an unknown camera or scanner."""
     for image in network.images:
         references: tuple[tuple[str, str, list[str]], ...] = (("camera", image.camera, list(network.camera_by_name)),)
         if image.scanner:
@@ -80,12 +80,6 @@ def _camera_faults(network: Network) -> Faults:
             if name not in given:
                 known = ", ".join(sorted(given)) or "none"
                 yield f"image {image.name} is of the {what} {name}, which is not given; given: {known}."
-        exterior = image.exterior
-        if exterior is not None and exterior.has_antenna and (exterior.sigmas[:3] == 0.0).any():
-            yield (
-                f"image {image.name}: the station is fixed by a standard deviation of 0, but it is an antenna's, which "
-                f"can be observed only. Give it a positive standard deviation, or no offset."
-            )
     for camera in network.cameras:
         c, distortion = camera.principal_distance_mm, camera.distortion
         if c is not None and c.value <= 0.0:

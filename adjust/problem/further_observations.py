@@ -1,4 +1,4 @@
-"""Observations other than image points and priors of single unknowns: distances, earlier calibrations, antennas.
+"""Observations other than image points and priors of single unknowns: distances, earlier calibrations.
 
 Each is a group of correlated observations l = f(x) + v of some unknowns, with the positions of the unknowns in f, the
 observed values and their covariance, and computed values and derivatives at a state.
@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adjust.array_types import Array, Indices
-from adjust.functional_model.rotation import cross_matrix, rotation_from_angles, vector_by_angles
 from adjust.problem.camera import FiducialDistance
 from adjust.problem.network import Network
 from adjust.problem.parameter import Parameter
@@ -44,7 +43,6 @@ def further_observations(network: Network, unknowns: Unknowns) -> tuple[FurtherO
         *_distances(network, unknowns),
         *(distance for _, distance in _fiducial_distances(network, unknowns)),
         *_calibrations(network, unknowns),
-        *(antenna for _, antenna in _antennas(network, unknowns)),
     )
 
 
@@ -106,47 +104,8 @@ def _calibrations(network: Network, unknowns: Unknowns) -> Iterator[ObservedCali
             )
 
 
-@dataclass(frozen=True)
-class ObservedAntenna(FurtherObservation):
-    """Coordinates of a point fixed to the camera; positions (6,): exterior orientation of the frame.
-
-    axes (m,): observed coordinates; offset (3,) from the projection centre along the camera's axes; keeps_angles:
-    whether the attitude is updated by its angles instead of a rotation vector.
-    """
-
-    axes: Indices
-    offset: Array
-    keeps_angles: bool
-
-    def computed(self, values: Array) -> Array:
-        rotation = rotation_from_angles(values[self.positions[3:]])
-        return np.asarray((values[self.positions[:3]] + rotation.T @ self.offset)[self.axes])
-
-    def jacobian(self, values: Array) -> Array:
-        """Derivatives: a rotation by the vector t applied to M changes M' a to M' (a - t x a)."""
-        angles = values[self.positions[3:]]
-        by_attitude = rotation_from_angles(angles).T @ cross_matrix(self.offset)
-        if self.keeps_angles:
-            by_attitude = by_attitude @ vector_by_angles(angles)
-        return np.hstack([np.eye(3), by_attitude])[self.axes]
-
-
-def _antennas(network: Network, unknowns: Unknowns) -> Iterator[tuple[str, ObservedAntenna]]:
-    """Antennas by frame."""
-    for image in {image.frame: image for image in network.images}.values():
-        exterior = image.exterior
-        if exterior is None or not exterior.has_antenna or image.name in network.unoriented:
-            continue
-        axes = np.flatnonzero(np.isfinite(exterior.sigmas[:3]))
-        if len(axes):
-            names = tuple(f"{image.frame} {'XYZ'[axis]}" for axis in axes)
-            given = unknowns.exterior[image.name], exterior.values[axes], np.diag(exterior.sigmas[axes] ** 2)
-            of_frame = axes, np.array(exterior.antenna), unknowns.keeps_angles(image.name)
-            yield image.frame, ObservedAntenna("antenna", names, names, *given, *of_frame)
-
-
 def error_free(network: Network, unknowns: Unknowns, values: Array) -> Network:
-    """Replace distances, calibrations and antennas of a network by error-free values."""
+    """Replace distances and calibrations of a network by error-free values."""
     of_fiducials = [
         (each, replace(each, value_mm=float(observed.computed(values)[0])))
         for each, observed in _fiducial_distances(network, unknowns)
@@ -166,15 +125,7 @@ def error_free(network: Network, unknowns: Unknowns, values: Array) -> Network:
         replace(each, values=np.array([values[number[key]] for key in each.parameters]))
         for each in network.calibrations
     )
-    antennas = dict(_antennas(network, unknowns))
-    images = []
-    for image in network.images:
-        if image.exterior is not None and image.frame in antennas:
-            exterior, antenna = image.exterior.values.copy(), antennas[image.frame]
-            exterior[antenna.axes] = antenna.computed(values)
-            image = replace(image, exterior=replace(image.exterior, values=exterior))
-        images.append(image)
-    return replace(network, cameras=cameras, distances=distances, calibrations=calibrations, images=tuple(images))
+    return replace(network, cameras=cameras, distances=distances, calibrations=calibrations)
 
 
 def square_sum(further: tuple[FurtherObservation, ...], values: Array) -> float:

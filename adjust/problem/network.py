@@ -14,7 +14,6 @@ from adjust.functional_model.board import BOARD_NAMES, BoardForm, board_form
 from adjust.functional_model.lens import Lens, Prior
 from adjust.functional_model.projection import STRAIGHT as STRAIGHT
 from adjust.functional_model.projection import LineOfSight as LineOfSight
-from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.scanner import Bend, is_term
 from adjust.functional_model.transformation import film_kind
 from adjust.problem.camera import Camera, FiducialDistance
@@ -32,13 +31,10 @@ class Exterior:
     ----------
     values : (6,) elements.
     sigmas : (6,) inf for an approximation, else the standard deviation of an observed element, 0 fixed.
-    antenna : offset of an observed point (an antenna) from the projection centre, along the camera's axes in object
-        units; X0, Y0, Z0 are then those of this point.
     """
 
     values: Array
     sigmas: Array = field(default_factory=lambda: np.full(6, np.inf))
-    antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if self.values.shape != (6,) or self.sigmas.shape != (6,):
@@ -50,13 +46,9 @@ class Exterior:
             )
 
     @property
-    def has_antenna(self) -> bool:
-        return any(self.antenna)
-
-    @property
     def center(self) -> Array:
         """(3,) projection centre."""
-        return np.asarray(self.values[:3] - rotation_from_angles(self.values[3:]).T @ np.array(self.antenna))
+        return self.values[:3]
 
 
 @dataclass(frozen=True)

@@ -157,8 +157,6 @@ def _add_images(
             if image.exterior is not None:
                 given = zip(image.exterior.values, image.exterior.sigmas, strict=True)
                 priors = [Prior(float(value), float(sigma)) for value, sigma in given]
-                if image.exterior.has_antenna:
-                    priors[:3] = [None] * 3  # the antenna is observed, not the projection centre
             quantities: list[Quantity] = list(zip(EXTERIOR_NAMES, priors, starts, strict=True))
             own = _stopped(quantities) if image.name in network.unoriented else quantities
             of_frame[image.frame] = rows.add("exterior", image.frame, "", own)

@@ -263,7 +263,7 @@ def wrong_orientations(network: Network, alone: Adjustment, family: float) -> tu
     units = np.where(np.arange(6) < 3, 1.0, np.degrees(1.0))
     for image in observed:
         exterior, at = image.exterior, alone.run.problem.unknowns.exterior[image.name]
-        if exterior is None or exterior.has_antenna:
+        if exterior is None:
             continue
         off = exterior.values - alone.values[at]
         off[3:] = (off[3:] + np.pi) % (2.0 * np.pi) - np.pi

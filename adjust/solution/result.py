@@ -107,7 +107,7 @@ class Adjustment(estimates.Estimates, PlottedResult):
 
     @cached_property
     def further(self) -> tuple[FurtherResidual, ...]:
-        """Residuals of distances, calibrations and antennas."""
+        """Residuals of distances and calibrations."""
         return tuple(further_residuals(self.run, self.probabilities.noncentrality(1)))
 
     @cached_property

@@ -440,7 +440,7 @@ def _exterior(pose: tuple[Array, Array] | None, given: Exterior | None) -> Exter
         return Exterior(np.concatenate([pose[1], angles_from_rotation(pose[0])]))
     rotation, station = pose
     angles = angles_near(rotation, given.values[3:])
-    values = np.concatenate([station + rotation.T @ np.array(given.antenna), angles])
+    values = np.concatenate([station, angles])
     return replace(given, values=np.where(_observed_elements(given), given.values, values))
 
 

@@ -142,11 +142,8 @@ class GivenImages:
     cuts: Mapping[str, tuple[int | None, Window | None]] = field(default_factory=dict)
 
 
-def read_images(path: FilePath, antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> GivenImages:
-    """Read images.csv. Images may be named with or without the file's ending. Raises InputError with the line.
-
-    antenna: offset of the point with the given X0, Y0, Z0 from the projection centre, as in `Exterior`.
-    """
+def read_images(path: FilePath) -> GivenImages:
+    """Read images.csv. Images may be named with or without the file's ending. Raises InputError with the line."""
     exterior: dict[str, Exterior | None] = {}
     camera, scanner, part_of, cuts, asks_writing = {}, {}, {}, dict[str, tuple[int | None, Window | None]](), False
     turned_deg = dict[str, int]()
@@ -154,7 +151,7 @@ def read_images(path: FilePath, antenna: tuple[float, float, float] = (0.0, 0.0,
         name = image_name(row.name("image"))
         if name in exterior:
             raise InputError(f"{path}, line {row.line}: image {name!r} is given twice. Remove one of the lines.")
-        exterior[name] = _exterior(row, antenna)
+        exterior[name] = _exterior(row)
         camera[name], scanner[name], part_of[name] = row.text("camera"), row.text("scanner"), row.text("part_of")
         if any(cut := _page_and_window(row)):
             cuts[name] = cut
@@ -234,7 +231,7 @@ def fill_images(path: Path, values: Mapping[str, Mapping[str, str]]) -> None:
         write_atomically(path, changed)
 
 
-def _exterior(row: Row, antenna: tuple[float, float, float]) -> Exterior | None:
+def _exterior(row: Row) -> Exterior | None:
     values = [row.number(element) for element in ELEMENTS]
     if all(value is None for value in values):
         return None
@@ -244,11 +241,8 @@ def _exterior(row: Row, antenna: tuple[float, float, float]) -> Exterior | None:
                 element, "is blank, but other elements of this orientation are given. Give all six or none."
             )
     sigmas = [row.sigma(sigma) for sigma in SIGMAS]
-    if any(antenna) and 0.0 in sigmas[:3]:
-        raise row.error(SIGMAS[sigmas.index(0.0)], "is 0, but an antenna can be observed only: give it a positive one.")
     to_rad = np.array([1.0, 1.0, 1.0, *[math.pi / 180.0] * 3])
     return Exterior(
         np.array(values, dtype=np.float64) * to_rad,
         np.array([math.inf if sigma is None else sigma for sigma in sigmas]) * to_rad,
-        antenna,
     )

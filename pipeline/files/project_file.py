@@ -273,12 +273,9 @@ def _read_tables(table: Table, needs_camera: bool = True) -> Project:
     folder = path.parent
     files = {key: getattr(given.object, key) for key in ("points", "images", "distances")}
     named = {key: folder / name for key, name in files.items() if name is not None}
-    antenna = given.object.antenna_offset
-    if any(antenna) and "images" not in named:
-        raise objects.error("antenna_offset", 'goes with images = "...", the file of the observed stations. Give both.')
     lacks_camera = not (needs_camera or given.camera.startswith(PREFIX) or (folder / given.camera).exists())
     _check_named(table, objects, "" if lacks_camera else given.camera, named)
-    images = object_files.read_images(named["images"], antenna) if "images" in named else None
+    images = object_files.read_images(named["images"]) if "images" in named else None
     scans, left_out = find_scans(table, given.scans, given.exclude) if given.scans is not None else ({}, frozenset())
     project = Project(
         path=path,

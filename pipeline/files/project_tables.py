@@ -205,9 +205,6 @@ class ObjectTable:
     crs: Annotated[str, 'Coordinate reference system, such as "EPSG:25832".'] = ""
     board_bend: Annotated[table_models.Sigma, "Of the board's middle off its plane, object units."] = 0.0
     transparent: Annotated[bool, "Whether a flat field is visible from both sides."] = False
-    antenna_offset: Annotated[
-        tuple[float, float, float], "Of the observed stations from the projection centres; goes with images."
-    ] = (0.0, 0.0, 0.0)
 
 
 @table_models.table_model

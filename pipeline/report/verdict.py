@@ -56,10 +56,6 @@ FURTHER: tuple[tuple[str, str, str, str, str, ReportSection | None], ...] = (
         "fiducial_distances", "distance between fiducials", "distances between fiducials",
         f"{_CONTRADICTED_BY}; v in µm)", f"Compare the camera file with the certificate; {_BOTH_NAMED}", "fiducials",
     ),
-    (
-        "antennas", "coordinate of antennas", "coordinates of antennas", f"{_CONTRADICTED_BY})",
-        "Look for a wrong image or time, and at the antenna's offset and its sign.", None,
-    ),
 )  # fmt: skip
 
 
@@ -107,7 +103,7 @@ def problems_by_test(data: ReportData, shots: list[ReportedFrame]) -> dict[str, 
         "σ₀": _too_large(solved) if solved and solved.has_sigma0 else (),
         "redundancy": [unchecked] if solved and solved.redundancy <= 0 else (),
         "reach of the lens": _lens_problems(data, solved) if solved else (),
-        "distances, calibrations, antennas": _further_problems(solved) if solved else (),
+        "distances, calibrations": _further_problems(solved) if solved else (),
         "gross errors": _suspects(solved) if solved else (),
         "OpenCV": [differs] if check and check.verdict == "differs" else (),
     }
@@ -185,7 +181,7 @@ def _suspect(row: assessment_record.SuspectRecord) -> str:
 
 
 def _further_problems(adjustment: AdjustmentRecord) -> Iterator[ReportedProblem]:
-    """Yield problems of earlier calibrations, distances and antennas that the images contradict."""
+    """Yield problems of earlier calibrations and distances that the images contradict."""
     heading, remedy = CALIBRATION
     tests = [test for test in adjustment.calibration_tests if test.p < CONTRADICTED]
     yield from (ReportedProblem(f"{heading}: {contradiction(test, adjustment.cameras)}.", remedy) for test in tests)

@@ -159,7 +159,6 @@ def adjustment_record(
         ),
         calibrations=tuple(ObservedQuantity(name, *numbers) for name, numbers in further["calibration"]),
         calibration_tests=tuple(map(_contradiction, adjustment.contradictions)),
-        antennas=tuple(ObservedQuantity(name, *numbers) for name, numbers in further["antenna"]),
     )
 
 
@@ -251,8 +250,7 @@ def _image(adjustment: Adjustment, image: Image) -> records.ImageRecord:
         film[name] = _quantity(adjustment, key, None, scale)
     elements, known = [], image.exterior
     for i, key in enumerate(exterior_keys):
-        is_antenna = known is not None and known.has_antenna and i < 3
-        given = None if known is None or is_antenna else Prior(float(known.values[i]), float(known.sigmas[i]))
+        given = None if known is None else Prior(float(known.values[i]), float(known.sigmas[i]))
         elements.append(_quantity(adjustment, key, given, DEG_PER_RAD if key.quantity in ANGLES else 1.0))
     if image.name in adjustment.network.unoriented:
         elements = [replace(each, sigma=math.nan) for each in elements]

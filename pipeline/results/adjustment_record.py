@@ -451,7 +451,6 @@ class AdjustmentRecord:
     fiducial_distances: tuple[assessment_record.FiducialDistanceRecord, ...] = ()
     calibrations: tuple[assessment_record.ObservedQuantity, ...]
     calibration_tests: tuple[assessment_record.ContradictionRecord, ...] = ()
-    antennas: tuple[assessment_record.ObservedQuantity, ...]
     groups: Mapping[str, Annotated[Group, FOREIGN]]
     history: tuple[Annotated[Iteration, FOREIGN], ...] = ()
 

@@ -97,7 +97,7 @@ class FiducialDistanceRecord:
 
 @dataclass(frozen=True, slots=True)
 class ObservedQuantity:
-    """Residual of a quantity of an earlier calibration (mm) or of an antenna coordinate (object units)."""
+    """Residual of a quantity of an earlier calibration, mm."""
 
     name: str
     value: Number

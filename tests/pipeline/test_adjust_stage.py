@@ -19,9 +19,8 @@ from studies import parametrize_with_studies
 from test_condition_equations import BENDS_MM, bent_board, make_network
 
 from adjust import Adjustment, Distortion, Network, Parameter, Prior, adjust
-from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.transformation import film_parameter_names
-from adjust.problem.network import EXTERIOR_NAMES, Transformation
+from adjust.problem.network import Transformation
 from pipeline import InputError, build_network, read_adjustment, read_comparator, read_project, write_adjustment
 from pipeline.adjusting import adjust_stage
 from pipeline.adjusting.adjust_stage import adjust_marks
@@ -166,34 +165,6 @@ def once_more(earlier: Path, folder: Path, **changes: tuple[str, str]) -> Adjust
     for name, change in changes.items():
         projects.replace_text(folder / f"{name}.toml", *change)
     return adjust_network(folder)
-
-
-@pytest.mark.parametrize("sigma", ["0.05", "0"])
-def test_observed_antennas_through_files(earlier: tuple[Path, Adjustment], sigma: str, tmp_path: Path) -> None:
-    """2.5 units away from the lenses, where the adjustment puts them, so that nothing moves but every station becomes
-    more certain."""
-    folder, first = earlier
-    offset = (0.5, -1.0, 2.2)
-    rows = ["image,X0,Y0,Z0,omega_deg,phi_deg,kappa_deg,sX0,sY0,sZ0"]
-    for image in first.network.images:
-        place = np.array([first.value(f"EO.{image.name}.{name}") for name in EXTERIOR_NAMES])
-        antenna = place[:3] + rotation_from_angles(place[3:]).T @ offset
-        values = [*antenna.tolist(), *np.degrees(place[3:]).tolist()]
-        rows.append(",".join([image.name, *map(repr, values), *[sigma] * 3]))
-    (tmp_path / "images.csv").write_text("\n".join(rows) + "\n")
-    keys = f'[object]\nimages = "images.csv"\nantenna_offset = {list(offset)}\n'
-    if sigma == "0":
-        with pytest.raises(InputError, match="column sX0: is 0, but an antenna can be observed only"):
-            once_more(folder, tmp_path, project=("[object]\n", keys))
-        return
-    result = once_more(folder, tmp_path, project=("[object]\n", keys))
-    for image in first.network.images:
-        name = f"EO.{image.name}.Z0"
-        assert result.value(name) == pytest.approx(first.value(name), abs=1e-3 * first.sigma(name))
-        assert result.sigma(name) < first.sigma(name)
-    written = written_again(result, tmp_path)
-    assert len(written.antennas) == 3 * len(first.network.images)
-    assert written.groups["antenna"].redundancy > 0.0
 
 
 @pytest.mark.parametrize("marks", [True, False])
