@@ -140,7 +140,7 @@ def orientations_elsewhere(network: Network, result: Adjustment, is_observed: bo
     plan = {
         point.id: np.array([point.X.value, point.Y.value])
         for point in network.points
-        if point.X and point.Y and point.id in network.observed_points
+        if point.X and point.Y and point.id in result.network.observed_points
     }
     if plan and (words := _other_unit(network, adjusted_places(result, list(plan))[:, :2], np.array([*plan.values()]))):
         return words.replace("stations or distances", "approximate X and Y")

@@ -137,6 +137,17 @@ def test_a_mark_and_a_picture_under_two_names_are_named() -> None:
     assert any("f0 again as f0" in each for each in adjust(*copied).warnings)
 
 
+def test_a_point_with_approximations_whose_rays_do_not_meet_is_left_out() -> None:
+    points = nets.field_points(np.random.default_rng(2), 14)
+    network, _ = nets.simulated(np.random.default_rng(1), points=points, point_sigma=np.inf)
+    known = (nets.set_sigma(each, nets.KNOWN if int(each.id) < 8 else nets.UNKNOWN) for each in network.points)
+    network = nets.keep_rows(network, lambda image, point, kind: kind == "fiducial" or point != "12" or image < "f2")
+    off = {nets.observation_row(network, "target", "f1", "12"): np.array([60.0, -70.0])}
+    result = adjust(nets.add_errors(replace(network, points=tuple(known)), off))
+    assert result.converged
+    assert list(result.unmet) == ["12"]
+
+
 def test_opencvs_own_calibration_of_the_planar_board() -> None:
     """The `opencv` family on OpenCV's observations: its parameters, its standard deviations, its rms per point."""
     case = load("iv_planar_board")
