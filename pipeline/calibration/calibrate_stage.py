@@ -17,6 +17,7 @@ from rich.console import Console
 
 from adjust.display import CameraPlots, PlottedResult, data_frame
 from adjust.errors import AdjustmentError
+from adjust.problem.network import Network
 from adjust.solution.adjustment import adjust
 from adjust.solution.result import Adjustment
 from adjust.validation import largest_sigma_mm
@@ -24,6 +25,7 @@ from measure import MeasurementError, open_scan
 from measure.boards.find import fitting_board, recognise_board
 from measure.boards.measure import recognise_dots
 from pipeline.adjusting.adjust_stage import adjust_marks, adjustment_options
+from pipeline.adjusting.network import build_network
 from pipeline.calibration import project_files
 from pipeline.calibration.intrinsics import (
     CameraIntrinsics,
@@ -178,13 +180,15 @@ class _CalibrationProject:
             cameras = (camera if each.name == camera.name else each for each in self.pictures.cameras)
             self.pictures = replace(self.pictures, cameras=tuple(cameras))
         _check_count(camera, left_out)
-        project, choice = self.write(), None
-        adjustment = adjust_marks(project, marks)
+        adjustment, choice, project = None, None, self.write()
         if self.options.lens == "auto":
-            choice = _chosen_lens(project, adjustment, camera, self.options)
+            with suppress(AdjustmentError):  # by the first lens, which a fisheye is not
+                adjustment = adjust_marks(project, marks)
+            choice = _chosen_lens(build_network(project, marks)[0], adjustment, project, self.options)
             if choice.model != self.lenses[camera.name]:
-                self.lenses[camera.name] = choice.model
-                adjustment = adjust_marks(self.write(), marks)
+                self.lenses[camera.name], adjustment = choice.model, None
+        if adjustment is None:
+            adjustment = adjust_marks(self.write(), marks)
         if not adjustment.converged:
             why = " ".join(adjustment.warnings[:1])
             raise InputError(
@@ -299,18 +303,21 @@ def _check_count(camera: CameraPictures, left_out: Mapping[str, str]) -> None:
 
 
 def _chosen_lens(
-    project: Project, first: Adjustment, camera: CameraPictures, options: project_files.CalibrationOptions
+    network: Network, first: Adjustment | None, project: Project, options: project_files.CalibrationOptions
 ) -> LensChoice:
-    """Select the lens model by cross-validation. All marks get one standard deviation, large enough for models with
-    larger misfit than the first, but no larger than an adjustment accepts: the first may not suit the lens at all."""
-    observations = first.network.observations
+    """Select the lens model of a camera by cross-validation over its images, also those left out by the first.
+
+    All marks get one standard deviation, large enough for models with larger misfit than the first, but no larger than
+    an adjustment accepts: the first may not suit the lens at all.
+    """
+    observations, largest_mm = network.observations, largest_sigma_mm(network)
     variance = float(np.median(np.trace(observations.covariance_mm2, axis1=1, axis2=2)) / 2.0)
-    variance += (GENEROUS**2 - 1.0) * first.unmodelled_mm[camera.name] ** 2
-    variance = min(variance, largest_sigma_mm(first.network) ** 2)
+    variance += (GENEROUS * sum(first.unmodelled_mm.values())) ** 2 if first else largest_mm**2
+    variance = min(variance, largest_mm**2)
     covariance = np.broadcast_to(variance * np.eye(2), observations.covariance_mm2.shape).copy()
-    alike = replace(first.network, observations=replace(observations, covariance_mm2=covariance))
+    alike = replace(network, observations=replace(observations, covariance_mm2=covariance))
     adjusted = partial(adjust, options=adjustment_options(project.adjust))
-    return choose_lens(alike, options.square_pixels, options.pixel_mm, adjusted, first.start)
+    return choose_lens(alike, options.square_pixels, options.pixel_mm, adjusted, first.start if first else None)
 
 
 def _nothing(

@@ -696,24 +696,23 @@ def test_a_fisheye_is_tried_where_the_field_is_wide(monkeypatch: pytest.MonkeyPa
         assert set(choice.rms_px) == tried
 
 
-def choose_wide_lens(network: Network, unmodelled_mm: float, monkeypatch: pytest.MonkeyPatch) -> LensChoice:
-    """Lens, opencv4 or fisheye, after a first adjustment with so large errors that are not modelled."""
+def choose_wide_lens(network: Network, unmodelled_mm: float | None, monkeypatch: pytest.MonkeyPatch) -> LensChoice:
+    """Lens, opencv4 or fisheye, after a first adjustment with so large errors that are not modelled, or without one."""
     monkeypatch.delitem(intrinsics.PARAMETERS, "opencv5")
     monkeypatch.delitem(intrinsics.PARAMETERS, "opencv8")
-    first: Any = SimpleNamespace(network=network, unmodelled_mm={"wide": unmodelled_mm}, start=None)
+    first: Any = unmodelled_mm and SimpleNamespace(unmodelled_mm={"wide": unmodelled_mm}, start=None)
     project: Any = SimpleNamespace(adjust=AdjustSettings())
     options: Any = SimpleNamespace(square_pixels=True, pixel_mm=PIXEL_MM)
-    camera: Any = SimpleNamespace(name="wide")
-    return calibrate_stage._chosen_lens(project, first, camera, options)
+    return calibrate_stage._chosen_lens(network, first, project, options)
 
 
-@pytest.mark.parametrize("images", [4, 9])
+@pytest.mark.parametrize(("images", "unmodelled_mm"), [(4, 0.006), (9, 0.006), (4, None)])
 def test_a_fisheye_is_taken_where_the_first_lens_does_not_suit_at_all(
-    images: int, monkeypatch: pytest.MonkeyPatch
+    images: int, unmodelled_mm: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Errors not modelled are so large that twice as much would be refused as of another unit."""
     network = equidistant_network(np.random.default_rng(3), 1.1, 200.0, images)
-    choice = choose_wide_lens(network, 0.006, monkeypatch)
+    choice = choose_wide_lens(network, unmodelled_mm, monkeypatch)
     assert choice.model == "fisheye"
     assert choice.rms_px["fisheye"] == pytest.approx(np.sqrt(2.0) * 1e-4 / PIXEL_MM, rel=0.2)
 
