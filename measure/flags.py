@@ -55,7 +55,6 @@ class Code(MeaningfulWord):
     BLUR = "blur", "Its blur differs from that of the other marks."
     NO_FIT = "no-fit", "The fit did not converge, or converged to something else."
     IMPRECISE = "imprecise", "Its standard deviation is large."
-    EDGES = "edges", "Its edges give another position than the fit."
     DUST = "dust", "Dust may hide in it."
     OFF_PLACE = "off-place", "Its position contradicts the other marks of the scan, or the orientation."
     OFF_FRAMES = "off-frames", "Its position contradicts the camera's other frames."
@@ -143,7 +142,7 @@ class Cause(MeaningfulWord):
         "Rotation and scale are those of the frame, with its standard deviations; they were not fitted.",
     )
     FILM = "film", "Film deformation, estimated from the camera's frames."
-    SECOND_METHOD = "second method", "Disagreement with the position from its edges."
+    SECOND_METHOD = "second method", "Difference of a faint mark's fit from its matched filter."
     GIVEN_PLACES = "given places", "Disagreement with the given coordinates."
     OTHER_FRAMES = "other frames", "Disagreement with the camera's other frames."
     INTERPOLATION = (

@@ -21,7 +21,7 @@ Kind = Literal["fiducial", "target", "tie", "join"]
 ON_FILM: tuple[Kind, ...] = ("fiducial", "join")  # kinds that are points of the film, not of the object
 # Stored results are reused only if this is unchanged. Increase it whenever measurements would change:
 # tests/measure/test_revision.py fails if that was forgotten.
-MEASURE_REVISION = 74
+MEASURE_REVISION = 75
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -90,8 +90,7 @@ class MarkMeasurement:
     covariance : of the centre, by causes; None if nothing was fitted.
     status : see `measure.flags`.
     reason : one sentence with its codes (`measure.flags`); may be empty only with status `measured`.
-    quality : named quantities of the fit: snr, contrast_dn, blur_px, noise_dn, damaged_fraction, second_method_sigmas,
-        ...
+    quality : named quantities of the fit: snr, contrast_dn, blur_px, noise_dn, damaged_fraction, ...
     """
 
     point: str
@@ -303,7 +302,6 @@ class MarkFit:
     blur_sigma : standard deviation of the logarithm of the blur, pixel included; infinite if the blur was not estimated
         or is at a limit of its range.
     size_sigma : standard deviation of the mark's relative size; infinite if not estimated.
-    edges : second place by the mark's edges.
     sloping : second place of an ellipse with a contrast gradient.
     line_width : logarithm of the width of the lines of a cross over the drawn width, and its standard deviation, where
         they are narrower than the least blur explains.
@@ -334,7 +332,6 @@ class MarkFit:
     significance: float = 0.0
     blur_sigma: float = np.inf
     size_sigma: float = np.inf
-    edges: SecondPlace | None = None
     sloping: SecondPlace | None = None
     line_width: tuple[float, float] | None = None
     own_shape: OwnShape | None = None

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.spatial.distance import pdist
-from scipy.special import chdtrc, chdtri, fdtrc
+from scipy.special import chdtrc, chdtri
 
 from measure.array_types import Array, Mask
 from measure.fiducials.consistency import (
@@ -34,12 +34,10 @@ from measure.fiducials.consistency import (
     frame_p_value,
 )
 from measure.fiducials.mark_comparison import check_own_figures
-from measure.fiducials.measure_frame import may_be_wrong
 from measure.fiducials.options import ANY_FILM, SCATTER_DEGREES, BelievedFilm
 from measure.flags import FALSE_DOUBT, NO_REASON, Cause, Code, Reason, Status
 from measure.geometry import UP_FROM_CAMERA
 from measure.marks.shapes import MOST_GIVEN_SIGMA_MM, FiducialLayout
-from measure.noise.robust_estimation import MEDIAN_EFFICIENCY
 from measure.results import FrameMeasurement, MarkMeasurement
 
 _UNKNOWN_MM = 1.0  # standard deviation of a pattern without prior knowledge
@@ -51,9 +49,6 @@ _CLIPPED_AT = 0.25  # upper-tail probability at whose quantile chi-squares are c
 _CLIPPED_EFFICIENCY = 0.6  # of a variance from clipped chi-squares, relative to one from the mean of squares
 _SAME_SITE = 1 / 3  # fraction of the least distance of two marks: closer marks of two frames share a site of the scan
 _MANY = 20  # frames of which one is no longer left out of the film scatter that it is tested by
-_AXES = 2
-_BELIEVED_DEGREES = 4.0  # degrees of freedom of the prior of the variance factor: on real film the edges differ by 1.4
-_SIGMAS = "second_method_sigmas"
 _NAMED_MARKS = 4  # largest number of marks named in a sentence
 
 
@@ -394,7 +389,7 @@ def check_frames(
     pitches_um : pixel pitch of each scan, in x and y.
     film : prior knowledge of the film.
     """
-    checked, films = check_own_figures(check_second_places(frames)), [film.sigma_mm] * len(frames)
+    checked, films = check_own_figures(frames), [film.sigma_mm] * len(frames)
     found = {i: _misfit(*pair, layout, film) for i, pair in enumerate(zip(checked, pitches_um, strict=True))}
     misfits = {place: each for place, each in found.items() if each is not None}
     # Frames of another size than the given coordinates tell nothing of what those of the camera have in common.
@@ -573,37 +568,3 @@ def _problem(place: int, shared: FramesExplanation, names: Sequence[str], known_
         f"{cause} {widened}",
         Code.BENT_FRAME,
     )
-
-
-# The place from a mark's edges differs from the matched one if the mark is damaged or not as drawn. Larger differences
-# in many of a camera's marks than their covariances explain mean that the drawings or the noise model are not exact: a
-# variance factor is estimated from their median, with a prior of 1. An outlier even with this factor is damaged. Any
-# other significant difference is added to the mark's covariance.
-
-
-def check_second_places(frames: Sequence[FrameMeasurement]) -> list[FrameMeasurement]:
-    """Test the second places of all frames of a camera, and doubt marks where they differ significantly from the
-    matched places."""
-    tested = [(n, m) for n, each in enumerate(frames) for m in _observed_fiducials(each) if _SIGMAS in m.quality]
-    squares = np.array([mark.quality[_SIGMAS] ** 2 for _, mark in tested])
-    # With the variance factor of the other marks. Below 1 it is not applied: small differences do not make the test
-    # stricter.
-    others = [np.median(np.delete(squares, n)) for n in range(len(squares))] if len(squares) > 1 else [0.0]
-    known = MEDIAN_EFFICIENCY * _AXES * (len(squares) - 1)
-    degrees = _BELIEVED_DEGREES + known
-    factor = np.maximum((_BELIEVED_DEGREES + known * np.array(others) / chdtri(_AXES, 0.5)) / degrees, 1.0)
-    is_alone = fdtrc(_AXES, degrees, squares / _AXES / factor) * len(squares) < FALSE_DOUBT
-    changed: list[dict[str, MarkMeasurement]] = [{} for _ in frames]
-    for index in np.flatnonzero(chdtrc(_AXES, squares) * len(squares) < FALSE_DOUBT).tolist():
-        number, mark = tested[index]
-        before = np.asarray(mark.covariance_px2)
-        off_px = float(np.hypot(mark.quality["second_method_col_px"], mark.quality["second_method_row_px"]))
-        is_weak = is_alone[index] or (may_be_wrong(before + off_px**2 / 2 * np.eye(2)) and not may_be_wrong(before))
-        reason = Reason(
-            f"its edges put it {off_px:#.2g} px elsewhere, {mark.quality[_SIGMAS]:.1f} standard deviations of the "
-            "difference: it is damaged, or not as drawn",
-            Code.EDGES,
-        )
-        doubted = _doubt(mark, Cause.SECOND_METHOD, off_px**2 / 2, reason if is_weak else NO_REASON)
-        changed[number][mark.point] = doubted
-    return [_replace_marks(*each) for each in zip(frames, changed, strict=True)]

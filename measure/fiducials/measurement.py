@@ -468,9 +468,6 @@ def _row(
         return _unmeasured(mark.id, detection, detection.predicted_px, detection.reason)
     names = "snr", "contrast_dn", "noise_dn", "blur_px", "damaged_fraction", "likeness", "significance"
     quality = {name: float(getattr(fit, name)) for name in (*names, "redundancy", "neighbour_correlation")}
-    if fit.edges is not None:  # offset of the second method's place from the matched one, and in standard deviations
-        col, row = fit.edges.offset_px.tolist()
-        quality |= {"second_method_col_px": col, "second_method_row_px": row, "second_method_sigmas": fit.edges.sigmas}
     status, reason = frame.verdict(index)
     covariance, name = fit.place_covariance, frame.scan.name
     if isinstance(mark.mark, MarkTemplate):

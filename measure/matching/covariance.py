@@ -39,8 +39,6 @@ _LEAST_PX = 400  # pixels of the frame needed to estimate the background's textu
 # 1/2, the value for a glow that stays constant while the light changes.
 _HALF_TONES = 0.5 / np.sqrt(3)
 _MOST = 1.0  # limit of the log contrast change: a larger one is a different scanner scale
-_SMOOTHING = 1.5  # in blurs: noise is about 1.3 times that of the match, and the two edges of a line stay separate
-_LEAST_SMOOTHING_PX = 1.0  # px; with less smoothing the derivative is undersampled
 _WORST_CONDITION = 1e6  # of the normal matrix: beyond it a place in a small window has no significant digits
 _OWN = 0.9  # share of the image in rotation and scale above which the frame contributes little
 _SPLITS = 8  # directions of lines that divide a mark into halves
@@ -252,38 +250,24 @@ def covariance_of_changed_tone(half_tones: Array, by_grey: Array, contrast_chang
     return np.asarray(moved @ moved.T)
 
 
-# A second place of a mark, by another method: by its edges, or with a contrast gradient.
-#
-# Both are linear in the residuals of the match, so the covariance of their difference to the matched place is known,
-# including the common part of the noise. A significant difference indicates damage or model misfit.
-
-
-def edge_place(fit: LinearFit, blur_px: float) -> SecondPlace | None:
-    """Compute the place from the mark's edges; None where they do not determine it.
-
-    Notes
-    -----
-    Least-squares matching weights grey values by the gradient of the mark's image. An edge detector (Haralick, 1984,
-    Digital step edges from zero crossing of second directional derivatives) finds the zero crossing of the second
-    derivative across an edge, under a Gaussian. Summed along the outline this gives an independent place. It does not
-    depend on gain, offset and smooth background, nor on the drawing where opposite edges are alike.
-    """
-    weights = edge_weights(fit.design[:2] * fit.used, max(_SMOOTHING * blur_px, _LEAST_SMOOTHING_PX)) * fit.used
-    response = inner_products(weights, fit.design)
-    # The residuals no longer contain the noise absorbed by the match: subtract that part of the weights.
-    return _second_place(fit, np.eye(2), response[:, :2], weights, weights - combine(response, fit.by_grey))
-
-
 def sloping_place(fit: LinearFit) -> SecondPlace | None:
     """Compute the place with two more unknowns, gradients of the contrast, in one step from the fit. None where they
-    are not estimable.
+    are not estimable, or noisy lags leave the covariance of the difference indefinite.
 
     Soft-edged dust on one side of a small disk shifts the disk and leaves a gradient of its contrast as its only trace.
-    The additional unknowns absorb that.
+    The additional unknowns absorb that. All is linear in the residuals of the match, so the covariance of the
+    difference to the matched place is known, including the common part of the noise.
     """
     sloping = fit.design[-GREY] * fit.design[-2:] * fit.used
     left = (sloping - combine(inner_products(sloping, fit.design), fit.by_grey)) * fit.used  # not absorbed by the match
-    return _second_place(fit, -inner_products(fit.by_grey[:2], sloping), inner_products(left, sloping), left, left)
+    normal = inner_products(left, sloping)
+    if not np.linalg.cond(normal) < _WORST_CONDITION:
+        return None
+    by_sums = np.asarray(-inner_products(fit.by_grey[:2], sloping) @ np.linalg.inv(normal), float)
+    covariance_px2 = fit.covariance(combine(by_sums, left))
+    if not np.all(np.linalg.eigvalsh(covariance_px2) > 0):
+        return None
+    return SecondPlace(by_sums @ inner_products(left, fit.residuals[None])[:, 0], covariance_px2)
 
 
 def line_width(fit: LinearFit, change: Array, held: int) -> tuple[float, float]:
@@ -304,52 +288,6 @@ def line_width(fit: LinearFit, change: Array, held: int) -> tuple[float, float]:
     if not (normal > 0 and variance > 0):
         return 0.0, np.inf
     return float(inner_products(left, fit.residuals[None])[0, 0]) / normal, float(np.sqrt(variance)) / normal
-
-
-def _second_place(fit: LinearFit, by_unknown: Array, normal: Array, weights: Array, left: Array) -> SecondPlace | None:
-    """Compute a second place from weighted sums of the residuals.
-
-    Parameters
-    ----------
-    by_unknown : (2, 2) derivatives of the place with respect to two unknowns.
-    normal : (2, 2) derivatives of the sums with respect to these unknowns.
-    weights : (2, height, width) weights of the residuals in the sums.
-    left : (2, height, width) derivatives of the sums with respect to the grey values.
-
-    Returns
-    -------
-    SecondPlace, or None where normal is singular or noisy lags leave the covariance indefinite.
-    """
-    if not np.linalg.cond(normal) < _WORST_CONDITION:
-        return None
-    by_sums = np.asarray(by_unknown @ np.linalg.inv(normal), float)
-    covariance_px2 = fit.covariance(combine(by_sums, left))
-    if not np.all(np.linalg.eigvalsh(covariance_px2) > 0):
-        return None
-    return SecondPlace(by_sums @ inner_products(weights, fit.residuals[None])[:, 0], covariance_px2)
-
-
-def edge_weights(slopes: Array, smoothing_px: float) -> Array:
-    """(2, height, width) weights of the grey values in the sums, along columns and rows, of second derivatives across
-    the edges. slopes (2, height, width): gradient of the mark's image."""
-    square = np.maximum((slopes**2).sum(axis=0), 1e-300)
-    across = (slopes[0] ** 2 / square, 2 * slopes[0] * slopes[1] / square, slopes[1] ** 2 / square)
-    reach = int(np.ceil(4 * smoothing_px))
-    place = np.arange(-reach, reach + 1.0)
-    smooth = np.exp(-(place**2) / (2 * smoothing_px**2))
-    smooth /= smooth.sum()
-    slope, bend = -place * smooth / smoothing_px**2, (place**2 / smoothing_px**2 - 1) * smooth / smoothing_px**2
-    bend -= bend.mean()  # a uniform area gives zero
-    along = ((bend, smooth), (slope, slope), (smooth, bend))
-    return np.stack(
-        [
-            sum(
-                cv2.sepFilter2D(part * share, cv2.CV_64F, *kernels, borderType=cv2.BORDER_CONSTANT)
-                for share, kernels in zip(across, along, strict=True)
-            )
-            for part in slopes
-        ]
-    )
 
 
 # Rotation and scale by the mark's own image, where it was matched with those of the frame.

@@ -18,7 +18,6 @@ from measure.marks.shapes import Mark, MarkShape, widen_lines
 from measure.matching.covariance import (
     BackgroundTexture,
     LinearFit,
-    edge_place,
     line_width,
     own_shape,
     place_covariance,
@@ -212,7 +211,6 @@ def _precision(fit: PictureFit, noise: NoiseModel, background: BackgroundTexture
         "significance": fit.contrast_dn / max(float(sigmas[-GREY]), 1e-6),
         "blur_sigma": blur_sigma,
         "size_sigma": float(sigmas[2]) if len(model.generators) else np.inf,
-        "edges": edge_place(linear, model.blur_px),
         "sloping": sloping_place(linear) if freedom == "ellipse" and model.background_px is None else None,
         "line_width": width,
         "own_shape": own_shape(linear, shape, strain, model.departures) if tells_shape else None,

@@ -106,10 +106,6 @@ class ReviewFrame:
         """JSON of a mark with all details."""
         mark = self.mark(point, kind)
         drawn, linear = self.layout_marks.get(point), self.pixel_from_mark(point, kind)
-        second = None  # place by the second method
-        if mark.center_px is not None and "second_method_col_px" in mark.quality:
-            offset_px = (mark.quality["second_method_col_px"], mark.quality["second_method_row_px"])
-            second = np.add(mark.center_px, offset_px)
         is_known = mark.covariance_px2 is not None and np.isfinite(mark.covariance_px2).all()
         parts = mark.covariance.parts.items() if mark.covariance and is_known else ()
         parts_px = [(c.shown, c.meaning, float(np.sqrt(max(np.trace(px2) / 2, 0.0)))) for c, px2 in parts]
@@ -119,7 +115,6 @@ class ReviewFrame:
             **mark_json(mark),
             "place": _pair(self.place_px(point, kind)),
             "predicted": _pair(self.predicted_px(point, kind)),
-            "second": _pair(second),
             "half": self.window_px(point, kind),
             "covariance": mark.covariance_px2.tolist() if mark.covariance_px2 is not None and is_known else None,
             "causes": [{"cause": cause, "meaning": meaning, "sigma_px": px} for cause, meaning, px in parts_px],

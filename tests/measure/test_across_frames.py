@@ -202,23 +202,6 @@ def test_ordinary_frames_have_no_problem() -> None:
     assert own_result <= 1
 
 
-def add_edges(frame: FrameMeasurement, sigmas: Sequence[float], off_px: float = 0.1) -> FrameMeasurement:
-    """The frame with second places of its marks, so many standard deviations and off_px from the matched ones."""
-    marks = []
-    for mark, own in zip(frame.marks, sigmas, strict=True):
-        quality = {"second_method_sigmas": own, "second_method_col_px": off_px, "second_method_row_px": 0.0}
-        marks.append(replace(mark, quality=quality))
-    return replace(frame, marks=tuple(marks))
-
-
-def test_a_mark_whose_edges_alone_put_it_elsewhere_is_weak() -> None:
-    layout = make_layout(EIGHT)
-    (frame,) = make_frames(layout, 1, np.random.default_rng(5))
-    checked = checked_together([add_edges(frame, (0.3, 1.0, 2.0, 0.7, 1.5, 9.0, 1.0, 2.0))], layout)
-    assert weak(checked) == {("0", "5")}
-    assert "its edges put it 0.10 px elsewhere" in checked[0].marks[5].reason
-
-
 def test_two_frames_of_another_size_do_not_make_three_right_ones_stretched() -> None:
     rng = np.random.default_rng(4)
     frames = make_frames(make_layout(FOUR), 3, rng)
@@ -229,26 +212,6 @@ def test_two_frames_of_another_size_do_not_make_three_right_ones_stretched() -> 
     checked = checked_together([*frames, *other], make_layout(FOUR))
     assert [len(frame.problems) for frame in checked] == [0, 0, 0, 1, 1]
     assert weak(checked) == set()
-
-
-def test_where_edges_put_all_marks_elsewhere_their_drawing_is_not_true_and_none_is_weak() -> None:
-    """What noise does not explain makes a mark less well known; weak only where it may be half a pixel off."""
-    layout = make_layout(EIGHT)
-    (frame,) = make_frames(layout, 1, np.random.default_rng(5))
-    sigmas = (3.0, 4.0, 5.0, 4.5, 3.9, 6.0, 4.2, 1.0)
-    (checked,) = checked_together([add_edges(frame, sigmas)], layout)
-    assert weak((checked,)) == set()
-    added = [mark.covariance.sigmas_px.get(Cause.SECOND_METHOD, 0.0) for mark in checked.marks if mark.covariance]
-    np.testing.assert_allclose(added, [0.0] + [0.1 / np.sqrt(2)] * 6 + [0.0])
-    assert len(weak(checked_together([add_edges(frame, sigmas, 0.3)], layout))) == 6
-
-
-def test_good_marks_differ_by_their_edges_no_more_often_than_stated() -> None:
-    rng, layout = np.random.default_rng(8), make_layout(FOUR)
-    (frame,) = make_frames(layout, 1, rng)
-    edges = (np.sqrt(rng.chisquare(2, 4)).tolist() for _ in range(100))
-    lost = sum(bool(weak(checked_together([add_edges(frame, each)], layout))) for each in edges)
-    assert lost <= 3  # one is expected at most
 
 
 WRONG_MARKS_SIGMA_PX = 0.03

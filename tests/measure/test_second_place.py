@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from drawn import Array, brute_picture, draw, ellipse, make_scan, placed
+from drawn import Array, draw, ellipse, make_scan
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.special import chdtrc
@@ -15,23 +15,14 @@ from measure.detection.localisation import MarkPrediction
 from measure.fiducials.mark_fit import detect_mark
 from measure.flags import Cause
 from measure.marks import shapes
-from measure.matching.covariance import LinearFit, edge_weights
+from measure.matching.covariance import LinearFit
 from measure.noise.noise_model import NoiseModel, combine, inner_products
 from measure.results import MarkFit, SecondPlace
 from measure.targets.disks import UNIT_DISK, fit_disk
 
-SIZE, CONTRAST = 41, 500.0
-RING_CROSS = shapes.MarkShape(shapes.ring_cross(1.0, 0.2, 1.6, 0.15))
-OPTIONS = MatchOptions(linear_sigma=0.05)
+CONTRAST = 500.0
 DISK_SIZE, RADIUS = 31, 3.0
 DISK_PLACE = np.array([15.2, 14.7])
-
-
-def edge_chances(mark: shapes.Mark, grey: Array, place: Array, options: MatchOptions, count: int) -> Array:
-    """The probabilities of the differences of the places by edges in so many noisy pictures."""
-    rng = np.random.default_rng(7)
-    noisy = [1000 + CONTRAST * grey + rng.normal(0, 20.0, grey.shape) for _ in range(count)]
-    return chances([match(ScanWindow(each), mark, place, options).edges for each in noisy])
 
 
 def disks(slope: float, sigma: float, count: int) -> list[MarkFit]:
@@ -59,13 +50,6 @@ def assert_as_likely(found: Array) -> None:
     assert found.min() > 1e-4
 
 
-def test_damage_that_no_mask_takes_out_is_visible_by_the_edges() -> None:
-    place = placed(10.0, (20.2, 19.7))
-    grey = brute_picture(RING_CROSS, place, SIZE, SIZE, 1.0)
-    grey[17:19, 21:34] = 1.0  # a scratch beside one arm
-    assert edge_chances(RING_CROSS, grey, place, replace(OPTIONS, damage_rounds=0), 5).max() < 1e-6
-
-
 def test_noise_alone_makes_every_probability_of_sloping_paint_as_likely() -> None:
     assert_as_likely(chances([fit.sloping for fit in disks(0.0, 20.0, 40)]))
 
@@ -89,20 +73,6 @@ def coarse(fine: NDArray[np.float64], col: int, row: int) -> NDArray[np.float64]
     rows = len(fine) // FOLD - 1
     part = fine[row : row + rows * FOLD, col : col + rows * FOLD]
     return np.asarray(part.reshape(rows, FOLD, rows, FOLD).mean(axis=(1, 3)))
-
-
-def test_the_sums_are_of_second_derivatives_across_the_edges() -> None:
-    """Of a picture with the same second derivatives everywhere, n'Hn summed over the edges' pixels is known."""
-    rng = np.random.default_rng(8)
-    slopes = np.zeros((2, SIZE, SIZE))
-    slopes[:, 15:-15, 15:-15] = rng.normal(size=(2, SIZE - 30, SIZE - 30))
-    weights = edge_weights(slopes, 1.6)
-    row, col = np.mgrid[:SIZE, :SIZE] - SIZE / 2
-    for hessian in (np.diag([1.0, 0.0]), np.array([[0.0, 1.0], [1.0, 0.0]]), np.array([[0.4, -0.7], [-0.7, 1.1]])):
-        picture = (hessian[0, 0] * col**2 + 2 * hessian[0, 1] * col * row + hessian[1, 1] * row**2) / 2
-        across = np.einsum("irc,ij,jrc->rc", slopes, hessian, slopes) / np.maximum((slopes**2).sum(axis=0), 1e-300)
-        expected = (slopes * across).sum(axis=(1, 2))
-        np.testing.assert_allclose((weights * picture).sum(axis=(1, 2)), expected, rtol=0.01, atol=0.02)
 
 
 def ragged(axis: int, rng: np.random.Generator) -> list[shapes.Bar]:

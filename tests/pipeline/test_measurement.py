@@ -222,7 +222,7 @@ MARK = MarkMeasurement(
     Covariance({Cause.NOISE: RNG.normal(size=(2, 2)), Cause.TONE: np.array([[np.inf, 0.0], [0.0, 1e-300]])}),
     Status.WEAK,
     Reason("dusty; large", Code.DUST, Code.SIZE),
-    {"snr": np.inf, "drift": -np.inf, "second_method_sigmas": np.nan, "blur_px": 0.1 + 0.2},
+    {"snr": np.inf, "drift": -np.inf, "likeness": np.nan, "blur_px": 0.1 + 0.2},
 )
 RICH = measured_record.MeasuredScan(
     "/scans/roll 7/a.tif",

@@ -243,7 +243,6 @@ function drawMark(view, pen, mark) {
   if (!state.overlay) return;
   for (const outline of mark.outlines) view.line(pen, outline, colour("outline"), 1);
   if (mark.predicted) view.cross(pen, mark.predicted, colour("predicted"), 8, 14);
-  if (mark.second) view.cross(pen, mark.second, colour("second"), 3, 8);
   if (mark.center && mark.covariance) {
     view.cross(pen, mark.center, colour("measured"), 6, 18);
     view.line(pen, ellipse(mark, view.zoom), colour("measured"), 1.5);
@@ -269,7 +268,6 @@ const FIGURES = { // [words, unit]
   snr: ["signal-to-noise ratio", ""],
   likeness: ["correlation", ""],
   damaged_fraction: ["damaged fraction", ""],
-  second_method_sigmas: ["second method", " σ off"],
 };
 
 function showFacts(mark) {
@@ -388,7 +386,7 @@ async function showWhole(frame, generation) {
 }
 
 function drawFrame(view, pen, frame) {
-  for (const { outline } of frame.writing ?? []) view.line(pen, outline, colour("second"));
+  for (const { outline } of frame.writing ?? []) view.line(pen, outline, colour("writing"));
   const found = state.trial?.marks ?? frame.marks.filter((mark) => mark.kind === "fiducial");
   for (const { point, status, center, place } of found) {
     const at = center ?? place;

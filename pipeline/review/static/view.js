@@ -2,7 +2,7 @@
 
 export const by = (id) => document.getElementById(id);
 export const COARSE_STEP = 8; // pixels of the page that an arrow key moves by in a whole scan; the window beside it shows as much about a click
-const COLOURS = { measured: "--measured", second: "--second", predicted: "--predicted", outline: "--outline" };
+const COLOURS = { measured: "--measured", writing: "--writing", predicted: "--predicted", outline: "--outline" };
 
 // --- asking the server
 
