@@ -1,6 +1,7 @@
 """Inner loops in C. Without a compiler at installation, `kernels` is None, and numpy and scipy do the same more slowly.
 
-Every kernel has one caller, which contains both versions. See docs/method/theory.md, section 13.
+Every kernel has one caller, which contains both versions; where it eliminates, dense blocks take the other one's place.
+See docs/method/theory.md, section 13.
 """
 
 from importlib import import_module

@@ -13,7 +13,7 @@ from reference_cases import CASES, case_approximations, case_network, load
 import compiled
 from adjust.functional_model.projection import LineOfSight
 from adjust.linear_algebra import elimination, sparse_factor
-from adjust.linear_algebra.elimination import SparseBlocks, eliminate_blocks
+from adjust.linear_algebra.elimination import eliminate_blocks
 from adjust.linear_algebra.factor import Blocks
 from adjust.linear_algebra.normal_equations import SharedEquations, SparseRows, SparsityPattern
 from adjust.linear_algebra.sparse_factor import Fronts, Triangle
@@ -145,41 +145,40 @@ def sparse_rows(seed: int) -> SparseRows:
     return SparseRows(pattern, matrix, rng.normal(size=(count, 2)), (further,), lambda: [])
 
 
-def eliminate(rows: SparseRows) -> tuple[SparseBlocks, SharedEquations, NDArray[np.float64]]:
-    """All blocks eliminated, what that leaves of the shared equations, and the cofactors of own unknowns."""
-    unknowns = 40 + 3 * 40
-    rng = np.random.default_rng(5)
-    equations = rows.equations(Fronts.single(40))
-    scale = np.sqrt(rows.column_squares(unknowns, equations))
-    scale[scale == 0.0] = 1.0
-    blocks = eliminate_blocks(rows, rng.uniform(0.1, 1.0, unknowns), rng.normal(size=unknowns), scale, equations)
-    shared = np.triu(rng.normal(size=(40, 40)))
-    shared[range(40), range(40)] = 5.0
-    triangle = Triangle(Fronts.single(40), (shared,), (np.empty((40, 0)),))
-    cofactors = np.full((40, 3, 3), np.nan)
-    for own, of_own in blocks.own_cofactors(triangle):
-        place = [int(np.flatnonzero((blocks.own == row).all(axis=1))[0]) for row in own]
-        cofactors[place] = of_own
-    return blocks, equations, cofactors
+@needs_kernels
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_compiled_elimination_is_that_of_dense_normal_equations(seed: int) -> None:
+    rows, rng, shared = sparse_rows(seed), np.random.default_rng(5), 40
+    pattern, matrix = rows.pattern, np.zeros((2 * len(rows.right), 160 + 1))
+    numbers = np.hstack([pattern.own[pattern.block], pattern.members[pattern.group], pattern.single])
+    for axis in (0, 1):
+        np.put_along_axis(matrix[axis::2], numbers, np.asarray(rows.matrix[:, axis]), axis=1)
+    weight, prior = rng.uniform(0.1, 1.0, 160), rng.normal(size=160)
+    (further,) = rows.further
+    beyond = np.zeros((2, 160))
+    beyond[:, further.shared[0]] = further.matrix[0]
+    whole = np.vstack([matrix[:, :-1], beyond, np.diag(np.where(np.arange(160) < shared, 0.0, weight))])
+    right = np.concatenate([rows.right.ravel(), np.ones(2), np.where(np.arange(160) < shared, 0.0, prior)])
+    normal, by_right = whole.T @ whole, whole.T @ right
+    through = normal[:shared, shared:] @ np.linalg.inv(normal[shared:, shared:])
+    reduced = normal[:shared, :shared] - through @ normal[shared:, :shared]
+    equations = rows.equations(Fronts.single(shared))
+    blocks = eliminate_blocks(rows, weight, prior, np.ones(160), equations)
+    np.testing.assert_allclose(np.tril(equations.squares[0]), np.tril(reduced), atol=1e-10)
+    np.testing.assert_allclose(equations.right, by_right[:shared] - through @ by_right[shared:], atol=1e-10)
+
+    root = np.linalg.cholesky(reduced + np.eye(shared)).T
+    normal[range(shared), range(shared)] += 1.0
+    cofactor = np.linalg.inv(normal)
+    for own, found in blocks.own_cofactors(Triangle(Fronts.single(shared), (root,), (np.empty((shared, 0)),))):
+        for numbers, each in zip(own, found, strict=True):
+            there = np.flatnonzero(numbers >= 0)
+            expected = cofactor[np.ix_(numbers[there], numbers[there])]
+            np.testing.assert_allclose(each[np.ix_(there, there)], expected, atol=1e-10)
 
 
 @needs_kernels
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_compiled_elimination_is_that_of_numpy(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    found, left, cofactors = eliminate(sparse_rows(seed))
-    monkeypatch.setattr(compiled, "kernels", None)
-    expected, expected_left, expected_cofactors = eliminate(sparse_rows(seed))
-    for name in ("triangle", "parts", "alone", "right", "orthonormal"):
-        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-12, err_msg=name)
-    np.testing.assert_allclose(np.tril(left.squares[0]), np.tril(expected_left.squares[0]), atol=1e-11)
-    np.testing.assert_allclose(left.right, expected_left.right, atol=1e-11)
-    np.testing.assert_allclose(cofactors, expected_cofactors, atol=1e-12)
-
-
-@pytest.mark.parametrize("loops", [pytest.param("compiled", marks=needs_kernels), "numpy"])
-def test_own_columns_are_orthonormal_even_if_nearly_parallel(loops: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    if loops == "numpy":
-        monkeypatch.setattr(compiled, "kernels", None)
+def test_own_columns_are_orthonormal_even_if_nearly_parallel() -> None:
     rows = sparse_rows(1)
     rows.matrix[..., 1] = rows.matrix[..., 0] + 1e-7 * rows.matrix[..., 1]
     nothing, equations = np.zeros(160), SharedEquations.zeros(Fronts.single(40))

@@ -1,6 +1,6 @@
 """Observation equations in pairs of rows with a sparsity pattern, and their normal equations in the shared unknowns."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,7 +13,6 @@ from adjust.linear_algebra.factor import Blocks
 from adjust.linear_algebra.sparse_factor import Fronts
 
 Arranged = Callable[[], Iterable[tuple[Indices, Blocks]]]  # pairs of rows (b, m), and their dense blocks of equal shape
-ROWS_AT_ONCE = 20_000  # pairs of rows in one batch, which then fits the processor's cache
 
 
 @dataclass(frozen=True)
@@ -51,14 +50,9 @@ class SparsityPattern:
         return self.group[self.order]
 
     @cached_property
-    def block_numbers(self) -> Indices:
-        """(m,) blocks of the pairs in `order`."""
-        return self.block[self.order]
-
-    @cached_property
     def first(self) -> Indices:
         """(b + 1,) index in `order` of each block's first pair; the last is m."""
-        return np.searchsorted(self.block_numbers, np.arange(len(self.own)))
+        return np.searchsorted(self.block[self.order], np.arange(len(self.own)))
 
     @cached_property
     def cells(self) -> tuple[Indices, Indices, Indices]:
@@ -73,14 +67,6 @@ class SparsityPattern:
         order = np.argsort(cell, kind="stable")
         unknowns = np.concatenate([self.members[kinds[:, 0]], kinds[:, 1:]], axis=1)
         return order, np.searchsorted(cell[order], np.arange(len(kinds) + 1)), unknowns
-
-    @cached_property
-    def place_in_border(self) -> Indices:
-        """(o, c, m) flat index in borders (b, o, t + 1) to which products of own and single columns are added."""
-        place = np.full(self.count + 1, len(self.singles), dtype=np.intp)
-        place[self.singles] = np.arange(len(self.singles))
-        rows = self.block_numbers * self.own.shape[1] + np.arange(self.own.shape[1])[:, None]
-        return np.asarray(rows[:, None] * (len(self.singles) + 1) + place[self.single[self.order]].T)
 
     @cached_property
     def _lowest(self) -> Indices:
@@ -108,26 +94,18 @@ class SparseRows:
     arranged: Arranged  # returns all rows as dense blocks, for rare uses
 
     def equations(self, fronts: Fronts) -> "SharedEquations":
-        """Normal equations of all rows in the shared unknowns, before the own ones are eliminated."""
+        """Normal equations of all rows in the shared unknowns, before the own ones are eliminated, by the kernels."""
         pattern, equations = self.pattern, SharedEquations.zeros(fronts)
         order, first, unknowns = pattern.cells
         home = fronts.home(np.where(unknowns >= 0, unknowns, pattern.count))
-        if compiled.kernels is not None:
-            given = (
-                self.right, np.concatenate(pattern.columns[1:]), order, first, unknowns,
-                np.argsort(home, kind="stable"), home, fronts.table, fronts.later_unknowns,
-            )  # fmt: skip
-            compiled.kernels.square_rows(
-                self.matrix, *map(np.ascontiguousarray, given), equations.values, equations.right
-            )
-        else:
-            squares = self._cell_squares()
-            np.add.at(equations.right, unknowns[unknowns >= 0], squares[:, :-1, -1][unknowns >= 0])
-            equations.add_squares(unknowns, home, squares[:, :-1, :-1])
+        assert compiled.kernels is not None
+        given = (
+            self.right, np.concatenate(pattern.columns[1:]), order, first, unknowns,
+            np.argsort(home, kind="stable"), home, fronts.table, fronts.later_unknowns,
+        )  # fmt: skip
+        compiled.kernels.square_rows(self.matrix, *map(np.ascontiguousarray, given), equations.values, equations.right)
         for block in self.further:
-            of_rows = block.matrix.swapaxes(1, 2)
-            equations.add_squares(block.shared, fronts.home(block.shared), of_rows @ block.matrix)
-            np.add.at(equations.right, block.shared, (of_rows @ block.right[..., None])[..., 0])
+            equations.add_rows(block.shared, block.matrix, block.right)
         return equations
 
     def column_squares(self, count: int, equations: "SharedEquations") -> Array:
@@ -140,22 +118,6 @@ class SparseRows:
         for front, square in zip(equations.fronts, equations.squares, strict=True):
             squares[front.columns] += np.diag(square)
         return squares[:-1]
-
-    def _cell_squares(self) -> Array:
-        """Normal matrices (p, w + c + 1, w + c + 1) of the cells' rows, the right side as the last column."""
-        pattern, (order, first, unknowns) = self.pattern, self.pattern.cells
-        width = unknowns.shape[1]
-        squares = np.empty((len(unknowns), width + 1, width + 1))
-        for cells in batches(first):
-            rows = order[first[cells.start] : first[cells.stop]]
-            columns = np.concatenate(
-                [take_columns(self.matrix, np.concatenate(pattern.columns[1:]), rows), self.right[rows].T[None]]
-            )
-            starts = first[cells] - first[cells.start]
-            for i, (x, y) in enumerate(columns):
-                sums = np.add.reduceat(x * columns[i:, 0] + y * columns[i:, 1], starts, axis=1).T
-                squares[cells, i, i:] = squares[cells, i:, i] = sums
-        return squares
 
 
 @dataclass(frozen=True)
@@ -180,31 +142,14 @@ class SharedEquations:
             for begin, shape in zip(begins, shapes, strict=True)
         ]
 
-    def add_squares(self, unknowns: Indices, home: Indices, squares: Array) -> None:
-        """Add normal matrices (b, s, s) of unknowns (b, s), -1 for none, to those of their fronts home (b,)."""
-        of_fronts, shape = self.squares, (self.fronts.count, self.fronts.count)
+    def add_rows(self, unknowns: Indices, rows: Array, right: Array) -> None:
+        """Add the normal equations of rows (b, m, s) in unknowns (b, s), and of their right sides (b, m)."""
+        of_fronts, shape, home = self.squares, (self.fronts.count, self.fronts.count), self.fronts.home(unknowns)
+        squares = rows.swapaxes(1, 2) @ rows
         for i in np.unique(home):
             own, values = unknowns[home == i], squares[home == i]
-            rows, columns = (np.broadcast_to(at, values.shape) for at in (own[:, :, None], own[:, None, :]))
-            there = (rows >= 0) & (columns >= 0)
-            summed = csr_array(coo_array((values[there], (rows[there], columns[there])), shape=shape)).tocoo()
-            rows, columns = (self.fronts[int(i)].places(at.astype(np.intp)) for at in (summed.row, summed.col))
-            of_fronts[i][rows, columns] += summed.data
-
-
-def batches(first: Indices) -> Iterator[slice]:
-    """Batches of consecutive sets of rows, the i-th from first[i] to first[i + 1], that fit the processor's cache."""
-    start = 0
-    while start < len(first) - 1:
-        stop = max(start + 1, int(np.searchsorted(first, first[start] + ROWS_AT_ONCE, side="right")) - 1)
-        yield slice(start, stop)
-        start = stop
-
-
-def take_columns(matrix: Array, columns: Indices, order: Indices) -> Array:
-    """Columns (c, 2, m) of pairs of rows (n, 2, k), taken in an order (m,)."""
-    taken = np.empty((len(columns), 2, len(order)))
-    for into, i in zip(taken, columns, strict=True):
-        for axis in range(2):
-            into[axis] = matrix[:, axis, i][order]
-    return taken
+            rows_at, columns = (np.broadcast_to(at, values.shape) for at in (own[:, :, None], own[:, None, :]))
+            summed = csr_array(coo_array((values.ravel(), (rows_at.ravel(), columns.ravel())), shape=shape)).tocoo()
+            into, columns = (self.fronts[int(i)].places(at.astype(np.intp)) for at in (summed.row, summed.col))
+            of_fronts[i][into, columns] += summed.data
+        np.add.at(self.right, unknowns, (rows.swapaxes(1, 2) @ right[..., None])[..., 0])

@@ -119,7 +119,7 @@ def test_normal_equations_give_what_reflections_give(count: int, monkeypatch: py
     monkeypatch.setattr(elimination, "REFLECTED", 0.0)
     monkeypatch.setattr(elimination, "CHEAP", 0.0)
     reflected = []
-    monkeypatch.setattr(elimination, "_reflect_all", lambda *_: reflected.append(True))
+    monkeypatch.setattr(elimination, "reflect_fronts", lambda *_: reflected.append(True))
     factor = factorise(numbering, at)
     assert not reflected
     sigmas = np.sqrt(by_reflections.variances())
