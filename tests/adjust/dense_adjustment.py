@@ -3,7 +3,7 @@
 It shares nothing with the adjustment but the network and the names of the unknowns. Angles are unknowns themselves, and
 all functions F1 to F9 with their priors stand in one full system."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,12 +24,17 @@ STEP = 1e-40
 
 @dataclass(frozen=True)
 class DenseResult:
-    """By name of unknown: value and a-priori standard deviation; v'Pv and the redundancy."""
+    """By name of unknown: value and a-priori standard deviation; their cofactors, v'Pv and the redundancy.
+
+    hidden (n, n): I - H of the whitened rows: two of each observation, one of each prior in `given`, the distances."""
 
     values: dict[str, float]
     sigmas: dict[str, float]
+    cofactor: Array
     vpv: float
     redundancy: int
+    hidden: Array
+    given: list[str]
 
 
 def solve_densely(network: Network, start: dict[str, float], mirrored: frozenset[str]) -> DenseResult:
@@ -38,7 +43,7 @@ def solve_densely(network: Network, start: dict[str, float], mirrored: frozenset
     names = [name for name in start if name not in priors or priors[name].sigma > 0.0]
     rows = range(len(network.observations))
     touched = {name: [row for row in rows if _touches(network, row, name)] for name in names}
-    names = [name for name in names if touched[name]]
+    names, distances = [name for name in names if touched[name]], distances_by_names(network)
     pseudo = [name for name in names if name in priors and np.isfinite(priors[name].sigma)]
     x = dict(start)
     observed = network.observations.xy_mm
@@ -69,7 +74,13 @@ def solve_densely(network: Network, start: dict[str, float], mirrored: frozenset
         for i, name in enumerate(pseudo):
             of_priors[i, names.index(name)] = 1.0 / priors[name].sigma
             of_priors[i, -1] = _difference(name, priors[name].value - x[name]) / priors[name].sigma
-        system = np.vstack([whitened, of_priors])
+        of_distances = np.zeros((len(distances), len(names) + 1))
+        for equation, (ends, (value, sigma)) in zip(of_distances, distances.items(), strict=True):
+            equation[-1] = (value - length(ends, values).real) / sigma
+            for name in set(ends) & set(names):
+                moved = values | {name: values[name] + 1j * STEP}
+                equation[names.index(name)] = length(ends, moved).imag / STEP / sigma
+        system = np.vstack([whitened, of_priors, of_distances])
         scale = np.linalg.norm(system[:, :-1], axis=0)
         q, r = np.linalg.qr(system[:, :-1] / scale)
         dx = np.linalg.solve(r, q.T @ system[:, -1]) / scale
@@ -85,8 +96,29 @@ def solve_densely(network: Network, start: dict[str, float], mirrored: frozenset
             break
     vpv = float((np.linalg.solve(network.observations.covariance_mm2, v[..., None])[..., 0] * v).sum())
     vpv += sum((_difference(name, priors[name].value - x[name]) / priors[name].sigma) ** 2 for name in pseudo)
+    vpv += sum(((length(ends, x).real - value) / sigma) ** 2 for ends, (value, sigma) in distances.items())
     redundancy = len(system) - len(names)
-    return DenseResult(x, dict(zip(names, sigmas.tolist(), strict=True)), vpv, redundancy)
+    by_name, hidden = dict(zip(names, sigmas.tolist(), strict=True)), np.eye(len(system)) - q @ q.T
+    return DenseResult(x, by_name, inverse @ inverse.T, vpv, redundancy, hidden, pseudo)
+
+
+def distances_by_names(network: Network) -> dict[tuple[str, ...], tuple[float, float]]:
+    """Value and standard deviation of each distance, by the names of its ends' coordinates, those of one end first."""
+    found = {}
+    for each in network.distances:
+        names = [f"PT.{end}.{axis}" if end in network.point_by_id else f"EO.{end}.{axis}0"
+                 for end in (each.start, each.end) for axis in "XYZ"]  # fmt: skip
+        found[tuple(names)] = each.value, each.sigma
+    for camera in network.cameras:
+        for measured in camera.distances:
+            names = [f"FID.{camera.name}.{end}.{axis}" for end in (measured.start, measured.end) for axis in "xy"]
+            found[tuple(names)] = measured.value_mm, measured.sigma_mm
+    return found
+
+
+def length(names: Sequence[str], values: Mapping[str, complex]) -> complex:
+    start, end = np.array([values[name] for name in names]).reshape(2, -1)
+    return complex(np.sqrt(((end - start) ** 2).sum()))
 
 
 def _priors(network: Network) -> dict[str, Prior]:

@@ -7,11 +7,12 @@ import cv2
 import networks as nets
 import numpy as np
 import pytest
+from dense_adjustment import distances_by_names, length, solve_densely
 from faults import center_of_gravity
 from numpy.typing import NDArray
 from reference_cases import CAMERA, case_approximations, case_network, load, own_name
 from scipy.integrate import quad
-from scipy.optimize import brentq, least_squares
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from studies import parametrize_with_studies
 
@@ -292,72 +293,22 @@ def observed_network(rng: np.random.Generator) -> tuple[Network, Array]:
     return replace(nets.set_camera(nets.orient(network, given), fiducials={}), distances=distances), points
 
 
-class Dense:
-    """The same sum of squares by formulas of the simulation, minimised without any structure."""
-
-    def __init__(self, network: Network, points: Array) -> None:
-        self.network = network
-        exteriors = TRUTH.exteriors
-        start = np.concatenate([[TRUTH.c, TRUTH.x0, TRUTH.y0, 1.5], exteriors.ravel(), points.ravel()])
-        found = least_squares(self.residuals, start, jac="3-point", x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
-        self.values = found.x
-        self.vpv = 2.0 * found.cost
-        jacobian = np.asarray(found.jac)
-        self.cofactor = np.linalg.inv(jacobian.T @ jacobian)
-
-    def residuals(self, x: Array) -> Array:
-        (c, x0, y0, k3), exterior, points = x[:4], x[4:28].reshape(4, 6), x[28:].reshape(-1, 3)
-        truth = nets.Truth(
-            c,
-            x0,
-            y0,
-            distortion={"k3": 1e-7 * k3},
-            stations=tuple(map(tuple, exterior[:, :3])),
-            attitudes=tuple(map(tuple, exterior[:, 3:])),
-        )
-        network, rows = self.network, self.network.observations
-        shown = points[np.array(rows.point, int)]
-        result = [
-            ((nets.camera_point(truth, i, shown[own]) - rows.xy_mm[own]) / 0.004).ravel()
-            for i, own in enumerate(np.array(rows.image) == [[f"f{i}"] for i in range(4)])
-        ]
-        camera = network.cameras[0]
-        given = [camera.principal_distance_mm, camera.x0_mm, camera.y0_mm, camera.distortion.parameters["k3"]]
-        result += [[(v - p.value) / p.sigma] for v, p in zip((c, x0, y0, 1e-7 * k3), given, strict=True) if p]
-        for row, image in zip(exterior, network.images, strict=True):
-            if image.exterior is not None:
-                result.append((row - image.exterior.values) / image.exterior.sigmas)
-        place = {f"f{i}": row[:3] for i, row in enumerate(exterior)} | {str(i): xyz for i, xyz in enumerate(points)}
-        result += [[(relative_rotation(place[d.start], place[d.end]) - d.value) / d.sigma] for d in network.distances]
-        return np.concatenate(result)
-
-
-NAMES = (
-    [f"IO.K.{name}" for name in ("c", "x0", "y0", "k3")]
-    + [f"EO.f{i}.{name}" for i in range(4) for name in ("X0", "Y0", "Z0", "omega", "phi", "kappa")]
-    + [f"PT.{i}.{axis}" for i in range(6) for axis in "XYZ"]
-)
-
-
 def test_observed_orientations_and_distances_as_in_a_dense_adjustment() -> None:
-    network, points = observed_network(np.random.default_rng(1))
-    dense = Dense(network, points)
+    network, _ = observed_network(np.random.default_rng(1))
     result = adjust(network, approximate(network))
-    scale = np.ones(len(NAMES))
-    scale[3] = 1e-7
-    sigmas = np.sqrt(np.diag(dense.cofactor)) * scale
-    difference = np.array([result.value(name) for name in NAMES]) - dense.values * scale
-    assert np.abs(difference / sigmas).max() < 1e-5
+    dense = solve_densely(network, dict(zip(result.names, result.values.tolist(), strict=True)), frozenset())
+    names, sigmas = list(dense.sigmas), np.array([*dense.sigmas.values()])
+    expected = np.array([dense.values[name] for name in names])
+    assert np.abs((result.values_of(names) - expected) / sigmas).max() < 1e-5
     assert result.vpv == pytest.approx(dense.vpv, rel=1e-9)
-    cofactor = dense.cofactor * np.outer(scale, scale)
-    np.testing.assert_allclose(
-        result.cofactor_of(NAMES) / np.outer(sigmas, sigmas), cofactor / np.outer(sigmas, sigmas), atol=1e-6
-    )
+    unit = np.outer(sigmas, sigmas)
+    np.testing.assert_allclose(result.cofactor_of(names) / unit, dense.cofactor / unit, atol=1e-6)
     conditions = 2 * 24 + 4 + 21 + 4
-    assert (result.conditions, result.redundancy) == (conditions, conditions - len(NAMES))
+    assert (result.conditions, result.redundancy) == (conditions, conditions - len(names))
+    assert dense.redundancy == result.redundancy
     assert sum(group.redundancy for group in result.groups.values()) == pytest.approx(result.redundancy)
-    distances = dense.residuals(dense.values)[-4:]
-    np.testing.assert_allclose([row.v / row.sigma for row in result.further], distances, atol=1e-6)
+    v = [length(ends, dense.values).real - value for ends, (value, _) in distances_by_names(network).items()]
+    np.testing.assert_allclose([row.v for row in result.further], v, atol=1e-6)
     assert [row.name for row in result.further] == [f"{each.start} to {each.end}" for each in network.distances]
     for row in result.further:
         assert row.w == pytest.approx(row.v / (row.sigma * np.sqrt(row.redundancy)))

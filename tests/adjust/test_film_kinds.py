@@ -6,11 +6,11 @@ from itertools import combinations
 import networks as nets
 import numpy as np
 import pytest
+from dense_adjustment import DenseResult, solve_densely
 from networks import halves, simulated
 from numpy.typing import NDArray
-from scipy.optimize import approx_fprime
 
-from adjust import Adjustment, AdjustmentError, Network, Options, Parameter, adjust, approximate
+from adjust import Adjustment, AdjustmentError, Fiducial, Network, Options, Parameter, Prior, adjust, approximate
 from adjust.functional_model.transformation import Film, film_kind, fit_transformation
 from adjust.problem.camera import FiducialDistance
 from adjust.problem.network import Image, Transformation
@@ -240,56 +240,15 @@ def observe_distances(
     return replace(drawn, network=nets.set_camera(network, distances=distances))
 
 
-def hold_marks(marks: int) -> list[int]:
-    """Which of all coordinates the distances leave open, as a frame of four corners or eight marks has them: both of
-    the first of the two marks farthest apart, and the one across of the other."""
-    first, last = max(
-        combinations(range(marks), 2), key=lambda two: np.hypot(*np.diff(nets.NOMINAL_MM[list(two)], axis=0)[0])
-    )
-    along = np.abs(nets.NOMINAL_MM[last] - nets.NOMINAL_MM[first])
-    return [2 * first, 2 * first + 1, 2 * last + (1 if along[0] >= along[1] else 0)]
-
-
-def written_out(drawn: nets.DrawnFrames, similar: bool) -> tuple[Array, Array, float]:
-    """Places (m, 2), their standard deviations and v'Pv: each comparator coordinate is a similarity or an affinity of
-    the place, each distance that of two places."""
-    network, marks = drawn.network, len(drawn.places_mm)
-    observed = network.observations.xy_mm.reshape(-1, marks, 2)
-    distances = network.cameras[0].distances
-    pairs = np.array([(int(each.start) - 1, int(each.end) - 1) for each in distances])
-    free = np.setdiff1d(np.arange(2 * marks), hold_marks(marks))
-    of_film = 4 if similar else 6
-
-    def split_places(x: Array) -> Array:
-        places = nets.NOMINAL_MM[:marks].ravel().copy()
-        places[free] = x[: len(free)]
-        return places.reshape(-1, 2)
-
-    def weighted(x: Array) -> Array:
-        places, rows = split_places(x), []
-        for own, p in zip(observed, x[len(free) :].reshape(len(observed), of_film), strict=True):
-            matrix = np.array([[p[2], -p[3]], [p[3], p[2]]]) if similar else p[2:].reshape(2, 2)
-            rows.append(((places @ matrix.T + p[:2]) - own).ravel() / nets.FRAME_NOISE_MM)
-        lengths = np.linalg.norm(places[pairs[:, 1]] - places[pairs[:, 0]], axis=1)
-        rows.append((lengths - [each.value_mm for each in distances]) / SIGMA_MM)
-        return np.concatenate(rows)
-
-    film = [0.0, 0.0, 1.0, 0.0] if similar else [0.0, 0.0, 1.0, 0.0, 0.0, 1.0]
-    x = np.concatenate([nets.NOMINAL_MM[:marks].ravel()[free], *[film] * len(observed)])
-    for _ in range(6):
-        jacobian = approx_fprime(x, weighted, 1e-6)
-        x = x - np.linalg.lstsq(jacobian, weighted(x))[0]
-    covariance = np.linalg.inv(jacobian.T @ jacobian)
-    sigmas = np.zeros(2 * marks)
-    sigmas[free] = np.sqrt(np.diag(covariance))[: len(free)]
-    return split_places(x), sigmas.reshape(-1, 2), float(weighted(x) @ weighted(x))
-
-
-def places(result: Adjustment, marks: int) -> tuple[Array, Array]:
-    names = [[f"FID.{nets.FILM_CAMERA}.{i + 1}.{axis}" for axis in "xy"] for i in range(marks)]
-    values = np.array([[result.value(name) for name in pair] for pair in names])
-    sigmas = np.array([[result.sigma(name) for name in pair] for pair in names])
-    return values, sigmas
+def solve_with_held_marks(network: Network, result: Adjustment) -> DenseResult:
+    """The adjustment written out, with those coordinates held that the result holds."""
+    fiducials = {}
+    for id_, mark in network.cameras[0].fiducials.items():
+        held = (result.sigma(Parameter.fiducial(nets.FILM_CAMERA, id_, axis)) == 0.0 for axis in "xy")
+        x, y = (0.0 if is_held else np.inf for is_held in held)
+        fiducials[id_] = Fiducial(Prior(mark.x_mm.value, x), Prior(mark.y_mm.value, y))
+    values = dict(zip(result.names, result.values.tolist(), strict=True))
+    return solve_densely(nets.set_camera(network, fiducials=fiducials), values, result.mirrored)
 
 
 @pytest.mark.parametrize(("marks", "kind"), [(4, "affine"), (8, "affine"), (4, "similarity"), (8, "similarity")])
@@ -298,14 +257,14 @@ def test_places_by_distances_are_those_of_the_adjustment_written_out(marks: int,
     drawn = observe_distances(nets.draw_frames(kind, 3, marks, 1.0, 0.05, rng), rng)
     result = adjust(drawn.network, drawn.start)
     assert result.converged
-    expected, sigmas, vpv = written_out(drawn, kind == "similarity")
-    values, claimed = places(result, marks)
-    np.testing.assert_allclose(values, expected, atol=2e-7)
-    np.testing.assert_allclose(claimed, result.sigma0 * sigmas, rtol=1e-4, atol=1e-9)
+    dense = solve_with_held_marks(drawn.network, result)
+    for name, sigma in dense.sigmas.items():
+        assert result.value(name) == pytest.approx(dense.values[name], abs=1e-4 * sigma)
+        assert result.sigma(name) == pytest.approx(result.sigma0 * sigma, rel=1e-4)
     unknowns = 2 * marks - 3 + 3 * (4 if kind == "similarity" else 6)
     redundancy = 3 * 2 * marks + marks * (marks - 1) // 2 - unknowns
     assert sum(group.redundancy for group in result.groups.values()) == pytest.approx(redundancy, abs=1e-6)
-    assert result.sigma0**2 * redundancy == pytest.approx(vpv, rel=1e-5)
+    assert result.sigma0**2 * redundancy == pytest.approx(dense.vpv, rel=1e-5)
     assert result.groups["fiducial distance"].redundancy == pytest.approx(
         sum(row.redundancy for row in result.further if row.group == "fiducial distance")
     )

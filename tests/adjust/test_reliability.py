@@ -8,6 +8,7 @@ import cv2
 import networks as nets
 import numpy as np
 import pytest
+from dense_adjustment import solve_densely
 from faults import shift_given
 from numpy.typing import NDArray
 from reference_cases import exact, load, realisation
@@ -16,14 +17,9 @@ from studies import parametrize_with_studies
 
 from adjust import Adjustment, AdjustmentError, Calibration, Camera, Fiducial, Options, Parameter, adjust
 from adjust.functional_model.lens import Distortion, Prior
-from adjust.functional_model.rotation import rotation_from_angles
 from adjust.functional_model.transformation import Film, film_parameter_names
-from adjust.least_squares.equations import Numbering, prior_root_weights
-from adjust.least_squares.iteration import linearise
-from adjust.problem.condition_equations import compute, derivatives
 from adjust.problem.estimates import GivenGroup, adjusted_image
 from adjust.problem.network import Approximations, Exterior, Network, ObjectPoint
-from adjust.problem.problem import State, number
 from adjust.quality.critical_values import Probabilities, robust_weights
 from adjust.quality.fiducial_corrections import common_transformation, corrections_to_given
 from adjust.quality.reliability import Reliability
@@ -282,37 +278,20 @@ def test_the_redescending_weights_are_the_published_ones() -> None:
 GROUPS = ("target", "fiducial", "control", "datum")
 
 
-def dense_sigmas(network: Network, start: Approximations, result: Adjustment) -> list[float]:
+def dense_sigmas(network: Network, result: Adjustment) -> list[float]:
     """Twice the inverse of Helmert's matrix, from the dense matrix I - B N^-1 B' of all whitened rows."""
-    problem = number(network, start)
-    factors = np.array([result.variance_factors[group] for group in GROUPS])
-    kinds = np.where(problem.is_fiducial, factors[1], factors[0])
-    names = np.array([each.text for each in problem.unknowns.parameters])
-    sigma = problem.unknowns.sigma.copy()
-    sigma[np.char.startswith(names, "PT.")] *= np.sqrt(factors[2])
-    sigma[np.char.startswith(names, "FID.")] *= np.sqrt(factors[3])
-    problem = replace(problem, unknowns=replace(problem.unknowns, sigma=sigma))
-    numbering = Numbering(problem)
-    state = State(result.values, rotation_from_angles(result.values[problem.exterior[:, 3:]]))
-    at = linearise(numbering, network.observations.covariance_mm2 * kinds[:, None, None], state)
-    assert at is not None
-    computed = compute(problem, state)
-    assert computed is not None
-    full = derivatives(problem, state, computed)
-    matrix = np.zeros((len(network.observations), 2, len(sigma) + 1))
-    whitened = np.linalg.solve(at.rows.root, full.by_unknowns)
-    for row, columns in enumerate(problem.columns):
-        matrix[row][:, columns] = whitened[row]
-    weights = prior_root_weights(numbering)
-    given = np.flatnonzero(weights > 0.0)
-    rows = np.vstack([matrix[..., numbering.free].reshape(-1, len(numbering.free)), np.diag(weights)[given]])
-    q, _ = np.linalg.qr(rows / np.linalg.norm(rows, axis=0))
-    hidden = np.eye(len(rows)) - q @ q.T
-    prefixes = np.array([name.split(".")[0] for name in names[numbering.free][given]])
-    observed = np.repeat(np.where(problem.is_fiducial, "fiducial", "target"), 2)
-    group = np.concatenate([observed, [{"PT": "control", "FID": "datum"}.get(p, p) for p in prefixes]])
-    helmert = [[(hidden[np.ix_(group == a, group == b)] ** 2).sum() for b in GROUPS] for a in GROUPS]
-    return list(factors * np.sqrt(2.0 * np.diag(np.linalg.inv(np.array(helmert)))))
+    factors, rows, owners = result.variance_factors, network.observations, {"PT": "control", "FID": "datum"}
+
+    def rescale(name: str, prior: Prior) -> Prior:
+        return replace(prior, sigma=prior.sigma * np.sqrt(factors.get(owners.get(name.split(".")[0], ""), 1.0)))
+
+    of_rows = np.array([factors[kind] for kind in rows.kind])[:, None, None]
+    weighted = nets.set_observations(nets.map_priors(network, rescale), covariance_mm2=rows.covariance_mm2 * of_rows)
+    dense = solve_densely(weighted, dict(zip(result.names, result.values.tolist(), strict=True)), result.mirrored)
+    of_priors = [owners.get(name.split(".")[0], "") for name in dense.given]
+    group = np.array([*np.repeat(rows.kind, 2), *of_priors])
+    helmert = [[(dense.hidden[np.ix_(group == a, group == b)] ** 2).sum() for b in GROUPS] for a in GROUPS]
+    return [factors[name] * np.sqrt(2.0 * v) for name, v in zip(GROUPS, np.diag(np.linalg.inv(helmert)), strict=True)]
 
 
 @parametrize_with_studies("points", [8, 20])  # images, then points are eliminated first
@@ -320,7 +299,7 @@ def test_the_sigmas_of_the_factors_are_helmerts(points: int) -> None:
     network, start = checkable(3, points)
     result = adjust(network, start, Options(variance_components=GROUPS))
     assert result.converged
-    expected = dense_sigmas(network, start, result)
+    expected = dense_sigmas(network, result)
     assert [result.variance_sigmas[group] for group in GROUPS] == pytest.approx(expected, rel=1e-3)
     for group in GROUPS:
         assert result.groups[group].sigma0 == pytest.approx(1.0, abs=2e-3)
