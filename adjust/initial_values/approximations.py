@@ -402,16 +402,14 @@ def _why_not_oriented(block: BlockState, image: str) -> str:
     sight = block.sights[image]
     xyz = known_field(sight, {**block.rough, **block.points}).xyz
     remedy = f"measure more known points, or give the orientation of image {image}."
-    if not block.poses and len(xyz) < 3:
+    if not block.poses and len(xyz) < FEWEST:
         return (
             f"image {image} sees {len(xyz)} known points, no other image sees enough either, and the images alone make "
             "no model that could be placed: that takes 8 common points of two images, and 7 known coordinates (X and Y "
             f"of two points and three heights, say). Either add these, {remedy}"
         )
-    if len(xyz) < 3:
-        return f"image {image} sees {len(xyz)} known points; resection needs 3, and 4 to be unique. Either {remedy}"
-    if len(xyz) == 3:
-        return f"image {image} sees 3 known points, which leave several orientations or none. Either {remedy}"
+    if len(xyz) < FEWEST:
+        return f"image {image} sees {len(xyz)} known points, and resection needs {FEWEST} to be unique. Either {remedy}"
     if where := _collinearity_words(xyz):
         return (
             f"image {image} sees {len(xyz)} known points, and all lie {where}. Correct their coordinates, or {remedy}"

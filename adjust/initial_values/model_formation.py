@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from adjust.array_types import Array, Mask
 from adjust.functional_model.rotation import rotation_from_vector
 from adjust.initial_values.pose import KnownField, Pose, Sight, image_distances, intersect
-from adjust.initial_values.resection import resect_images
+from adjust.initial_values.resection import FEWEST, resect_images
 
 SAMPLES = 150
 CANDIDATES = 4  # poses returned: must include both interpretations of a flat scene
@@ -280,7 +280,7 @@ def extend(block: BlockState) -> None:
         block.points = intersect_points(block, WELL_DETERMINED)
         waiting = [name for name in sorted(block.sights) if name not in block.poses]
         new: dict[str, Pose] = {}
-        for fewest in (SURE_RESECTION, 4, 3) if waiting else ():
+        for fewest in (SURE_RESECTION, FEWEST) if waiting else ():
             new = new or _resect_stations(block, waiting, fewest)
         if not new:
             return

@@ -37,8 +37,6 @@ TYPICAL = 10  # images needed to estimate the residuals due to a still unknown l
 LARGEST_TYPICAL = 0.01  # in principal distances: a larger median may mean that all resections are wrong
 REJECTION = 13.8  # 0.1 % point of the squared residual's chi-square (2) distribution, in sigma²
 IMPLAUSIBLE = 0.05  # in principal distances: larger residuals mean misidentified points
-EXACT = 1e-12  # largest squared residual of an exact solution for three points
-SAME_PLACE = 1e-4  # in extents of the points: poses nearer than this are the same
 LINE = 1e-5  # width over length of collinear points: the camera may rotate around their line
 POINTS_AT_ONCE = 20_000
 SOUND = 0.95  # least share of inliers without gross errors
@@ -82,22 +80,15 @@ def resect_images(fields: Sequence[KnownField], principal_distances_mm: Sequence
 
     Parameters
     ----------
-    fields : at least three points per image.
+    fields : at least four points per image.
     principal_distances_mm : one per image.
 
     Returns
     -------
-    Poses; None for an image without a plausible one, or with several solutions of its three points.
+    Poses; None for an image without a plausible one.
     """
-    poses: list[Pose | None] = []
-    found = resections(fields, principal_distances_mm)
-    for field, c, resection in zip(fields, principal_distances_mm, found, strict=True):
-        if len(field.xyz) == 3:
-            candidates = three_point_poses(field.xyz, field.xy_mm, c)
-            poses.append(candidates[0] if len(candidates) == 1 else None)
-        else:
-            poses.append(None if resection is None or resection.sigma_mm > IMPLAUSIBLE * c else resection.pose)
-    return poses
+    found = zip(resections(fields, principal_distances_mm), principal_distances_mm, strict=True)
+    return [None if each is None or each.sigma_mm > IMPLAUSIBLE * c else each.pose for each, c in found]
 
 
 def resect(xyz: Array, xy_mm: Array, principal_distance_mm: float, floor_mm: float = 1e-4) -> Resection | None:
@@ -178,20 +169,6 @@ def trial_misfits(fields: Sequence[KnownField], principal_distances_mm: Array) -
         variances[some[image]] = (sigma * batch.c[image]) ** 2
     floor = np.array([field.sigma_mm for field in thin]) ** 2
     return np.asarray(np.exp(np.log(variances.reshape(-1, len(thin)) + floor).mean(axis=1)))
-
-
-def three_point_poses(xyz: Array, xy_mm: Array, principal_distance_mm: float) -> list[Pose]:
-    """All exact poses (up to four) for three points, xyz (3, 3), observed at xy_mm (3, 2)."""
-    field = _Fields.from_fields([KnownField(xyz, xy_mm, 0.0)], np.array([principal_distance_mm]))
-    rotations, shifts, triple = triple_poses(field.points, field.tangents)
-    points, tangents = field.points[triple], field.tangents[triple]
-    rotations, shifts = refined_poses(rotations, shifts, points, tangents, np.ones(points.shape[:2]))
-    exact = squared_residuals(rotations, shifts, points, tangents).max(axis=1) < EXACT
-    poses: list[Pose] = []
-    for pose in field.poses(rotations[exact], shifts[exact], np.zeros(exact.sum(), dtype=np.intp)):
-        if all(np.linalg.norm(pose.center - other.center) > SAME_PLACE * field.size[0] for other in poses):
-            poses.append(pose)
-    return poses
 
 
 def distance_together(

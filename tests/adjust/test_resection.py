@@ -15,7 +15,7 @@ from adjust import AdjustmentError, Camera, Distortion, Network, Options, Prior,
 from adjust.functional_model.transformation import film_kind
 from adjust.initial_values import resection
 from adjust.initial_values.model_formation import absolute_orientation
-from adjust.initial_values.pose import KnownField, Pose, image_distances, intersect
+from adjust.initial_values.pose import KnownField, Pose, intersect
 from adjust.problem.network import EXTERIOR_NAMES, Approximations, ObjectPoint
 
 Array = NDArray[np.float64]
@@ -39,19 +39,6 @@ def simulated_poses(
     projected, _ = cv2.projectPoints(xyz, cv2.Rodrigues(downward)[0], -downward @ center, camera_matrix, np.zeros(5))
     xy = projected.reshape(-1, 2) * [1.0, -1.0] + rng.normal(0.0, noise_mm, (n, 2))
     return xyz + ORIGIN, xy, Pose(rotation, center + ORIGIN)
-
-
-def test_three_points_leave_several_poses_the_true_one_among_them() -> None:
-    rng = np.random.default_rng(3)
-    counts = []
-    for _ in range(20):
-        xyz, xy, pose = simulated_poses(3, 0.4, 0.5, rng)
-        poses = resection.three_point_poses(xyz, xy, C_MM)
-        counts.append(len(poses))
-        assert min(float(np.linalg.norm(candidate.center - pose.center)) for candidate in poses) < 1e-2
-        assert all(image_distances(candidate, xyz, xy, C_MM).max() < 0.02 for candidate in poses)
-    assert max(counts) <= 4
-    assert max(counts) > 1
 
 
 def test_points_on_one_line_give_no_pose() -> None:
@@ -365,7 +352,7 @@ def test_an_image_that_the_others_do_not_help_is_named() -> None:
     _, _, third, *others = sorted(observed)
     network = nets.free_points(truth.network, {third})  # seen nowhere else, and so no help
     few = nets.keep_rows(network, lambda image, point, _: point not in others if image == "f3" else point != third)
-    with pytest.raises(AdjustmentError, match="image f3 sees 2 known points; resection needs 3"):
+    with pytest.raises(AdjustmentError, match="image f3 sees 2 known points, and resection needs 4"):
         approximate(few)
 
 
