@@ -24,7 +24,6 @@ Item = TypeVar("Item")
 
 _CHEAP_BYTES = 64_000_000  # largest file that is hashed whole without a request: 40 ms
 _PIECES, _PIECE = 8, 32768  # number and bytes of pieces of a file, spread evenly from its first byte to its last
-_PIECE_BYTES = 1 << 20
 
 
 def fingerprint(value: object) -> str:
@@ -183,14 +182,11 @@ def content_hash(path: Path) -> str:
 
     It takes 0.6 s of CPU per GB, so it is computed only where needed.
     """
-    digest = hashlib.sha256()
     try:
         with path.open("rb") as file:
-            while piece := file.read(_PIECE_BYTES):
-                digest.update(piece)
+            return hashlib.file_digest(file, "sha256").hexdigest()
     except (OSError, MissingError, UnreachableError):
         return ""
-    return digest.hexdigest()
 
 
 def alike_groups(items: Iterable[Item], *values: Callable[[Item], object]) -> list[list[Item]]:

@@ -158,7 +158,9 @@ def _some_heights(network: Network) -> Iterator[NetworkHypothesis]:
         if not names:
             continue
         points = (replace(each, Z=_scaled(each.Z, factor)) if each.id in names else each for each in network.points)
-        points = (replace(each, Z=_loosened(each.Z)) if each.id in doubtful else each for each in points)
+        points = (
+            replace(each, Z=each.Z and Prior(each.Z.value, np.inf)) if each.id in doubtful else each for each in points
+        )
         who = f"{len(names)} of {len(network.known_places)} points ({shortened(sorted(names), NAMED)})"
         yield NetworkHypothesis(
             f"Z of {who} is {times_too(factor)} for the others: another unit",
@@ -168,10 +170,6 @@ def _some_heights(network: Network) -> Iterator[NetworkHypothesis]:
 
 def _scaled(prior: Prior | None, factor: float) -> Prior | None:
     return prior and Prior(factor * prior.value, abs(factor) * prior.sigma)
-
-
-def _loosened(prior: Prior | None) -> Prior | None:
-    return prior and Prior(prior.value, np.inf)
 
 
 def _move_points(network: Network, by: Array) -> Network:
@@ -349,12 +347,6 @@ def exchanged_cameras(network: Network, given: Adjustment, trials: Trials) -> st
     )
 
 
-def _hold_principal_distances(network: Network) -> Network:
-    """Fix principal distances, at 1.5 times the extent of the images: where these leave them open, any value fits."""
-    held = Prior(1.5 * float(np.ptp(network.observations.xy_mm)), 0.0)
-    return replace(network, cameras=tuple(replace(each, principal_distance_mm=held) for each in network.cameras))
-
-
 def blunder_sentence(network: Network, given: Adjustment | None, trials: Trials) -> str:
     """Describe the blunder of a whole network without which all observations agree; empty where there is none.
 
@@ -365,8 +357,11 @@ def blunder_sentence(network: Network, given: Adjustment | None, trials: Trials)
     if given is None:  # perhaps only the given approximations are wrong
         given = trials.adjust(network)
         # Images that look straight at a flat field fit with any principal distance, and a stretched field by tilts.
-        if given is None and trials.explains(trials.adjust(_hold_principal_distances(network))):
-            return ""
+        if given is None:
+            held = Prior(1.5 * float(np.ptp(network.observations.xy_mm)), 0.0)
+            of_held = tuple(replace(each, principal_distance_mm=held) for each in network.cameras)
+            if trials.explains(trials.adjust(replace(network, cameras=of_held))):
+                return ""
     if given is not None and (cameras := exchanged_cameras(network, given, trials)):
         return cameras
     if trials.explains(given):

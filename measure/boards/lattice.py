@@ -165,12 +165,6 @@ def _outline_shifts(columns_rows: Integers, places: list[Place]) -> list[Integer
     return [-least - np.array(spare) for spare in product(range(int(extra[0]) + 1), range(int(extra[1]) + 1))]
 
 
-def _whole_counts(lattice: dict[Place, int], is_staggered: bool) -> list[tuple[int, int]]:
-    """(columns, rows) of the grid that a lattice fills best; in both directions."""
-    scores = _count_scores(lattice, is_staggered)
-    return [count for count, score in scores.items() if score == max(scores.values())]
-
-
 def _count_scores(lattice: dict[Place, int], is_staggered: bool) -> dict[tuple[int, int], float]:
     """How well a lattice fills grids of (columns, rows), in points, without sparse lines at its sides. Empty if most of
     the lattice fills none: the picture then shows a part of the grid."""
@@ -230,8 +224,9 @@ def find_grid(points_px: Array, appearances: Array, spec: CircleGridSpec | Squar
     lattices = _lattices(points_px, appearances)
     assignments = _best_outlines(lattices, places)
     is_staggered = isinstance(spec, CircleGridSpec) and spec.asymmetric
-    counts = _whole_counts(lattices[0], is_staggered) if lattices else []
-    counts = [count for count in counts if min(count) >= spec.fewest]
+    scores = _count_scores(lattices[0], is_staggered) if lattices else {}
+    best = max(scores.values(), default=0)
+    counts = [count for count, score in scores.items() if score == best and min(count) >= spec.fewest]
     is_larger = any(columns * rows > spec.columns * spec.rows for columns, rows in counts)
     if is_larger or not is_whole(assignments):
         message = f"no grid of {size} is whole in the scan; {len(points_px)} spots are candidates for {what}"

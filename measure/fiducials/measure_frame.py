@@ -366,15 +366,10 @@ class Frame:
         own_px2 = fit.place_covariance.without(Cause.SMEAR).px2  # a smear has a reason of its own
         sigma_px = largest_sigma_px(own_px2)
         is_plain = fit.covariance_is_white and sigma_px <= _PLAIN_SIGMA_PX
-        if _may_be_wrong(own_px2) and not is_plain:
+        if chdtrc(2, (_WRONG_PX / sigma_px) ** 2) > LARGE_ERROR and not is_plain:
             reasons.append(Reason(f"its standard deviation is {sigma_px:.2f} px", Code.IMPRECISE))
         reason = Reason.combine(reasons)
         return (Status.WEAK, reason) if reason else (Status.MEASURED, NO_REASON)
-
-
-def _may_be_wrong(covariance_px2: Array) -> bool:
-    """Whether a place with this covariance (2, 2) may have a larger error than a measured mark may have."""
-    return bool(chdtrc(2, (_WRONG_PX / largest_sigma_px(covariance_px2)) ** 2) > LARGE_ERROR)
 
 
 def measure_frame(

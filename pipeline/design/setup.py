@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -88,7 +88,10 @@ def scene_setup(scene_file: SceneFile) -> Setup:
             f"{scene_file.path}: [design] control_points: the field has no target {min(unknown)!r}. Its targets are "
             f"{targets[0].id!r} to {targets[-1].id!r}."
         )
-    images = _frames(scene_file.scene.images)
+    # Frames that are to be scanned in parts are planned as a whole, under their own names.
+    frames = {image.frame: image for image in reversed(scene_file.scene.images)}
+    whole = [replace(image, name=frame, part_of="", part=(0.0, 1.0)) for frame, image in reversed(frames.items())]
+    images = tuple(whole)
     _check_named(scene_file, {target.id for target in targets}, {image.name for image in images})
     points = []
     for target in targets:
@@ -105,12 +108,6 @@ def scene_setup(scene_file: SceneFile) -> Setup:
             'Write transformation = "none", or add the fiducials.'
         )
     return Setup(scene_file.scene.camera, scene_file.camera, transformation, tuple(points), images, settings)
-
-
-def _frames(images: Sequence[SceneImage]) -> tuple[SceneImage, ...]:
-    """The exposed frames: those to be scanned in parts are planned as a whole, under their own names."""
-    frames = {image.frame: image for image in reversed(images)}
-    return tuple(replace(image, name=frame, part_of="", part=(0.0, 1.0)) for frame, image in reversed(frames.items()))
 
 
 def _check_named(scene_file: SceneFile, targets: set[str], images: set[str]) -> None:

@@ -283,13 +283,9 @@ def fit(certificate: Certificate) -> FittedTable:
     coefficients[:count] = solution[1:]
     equivalent = certificate.distance_mm + float(solution[0])
     along = np.linspace(0.0, radius.max(), _CURVE)[1:]
-    calibrated, *_ = balanced_distance(along, (along - _curve(coefficients, along)) / equivalent)
+    displacement = np.asarray(sum(k * along**power for k, power in zip(coefficients, POWERS, strict=True)))
+    calibrated, *_ = balanced_distance(along, (along - displacement) / equivalent)
     return FittedTable(equivalent, calibrated, coefficients, sigmas, 1000.0 * residuals)
-
-
-def _curve(coefficients: Array, radius_mm: Array) -> Array:
-    """Distortion (n,) in mm relative to the equivalent principal distance."""
-    return np.asarray(sum(k * radius_mm**power for k, power in zip(coefficients, POWERS, strict=True)))
 
 
 def decentering(certificate: Certificate, fitted: FittedTable) -> Array:
