@@ -370,11 +370,6 @@ class Triangle:
 
     def _local_roots(self, i: int, places: Indices) -> Array:
         """Roots (b, s', s') of the cofactor matrices of unknowns of front i, given by their places (b, s') in it."""
-        if self._conditions[i] > SAFE:
-            try:
-                return np.asarray(np.linalg.cholesky(self._local_cofactors(i, places)), dtype=np.float64)
-            except np.linalg.LinAlgError:  # the condition number of the cofactor matrix is that of its root, squared
-                pass
         rows = self.roots[i][places].swapaxes(1, 2)
         return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64).swapaxes(1, 2)
 
