@@ -105,8 +105,8 @@ class Reason(str):
 
     @classmethod
     def read(cls, sentence: str, code: str) -> Self:
-        """Read a stored reason. Raises ValueError for an unknown code."""
-        return cls(sentence, *(Code(each) for each in code.split()))
+        """Read a stored reason, without codes that only other versions know."""
+        return cls(sentence, *(Code(each) for each in code.split() if each in Code._value2member_map_))
 
     def reword(self, sentence: str) -> Self:
         """Copy of the reason with another sentence and the same codes."""

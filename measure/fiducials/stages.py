@@ -20,7 +20,7 @@ import numpy as np
 from measure.array_types import Array
 from measure.detection.correlation import CLOSE, GRAINY, WIDE, Surroundings, chance_of_marks, share_of_places
 from measure.fiducials.camera_recognition import find_pitch_mm
-from measure.fiducials.constellation import AS_GOOD, FREE_MARKS, NARROW, Placement, distinct_places, same_picture
+from measure.fiducials.constellation import AS_GOOD, FREE_MARKS, Placement, distinct_places, same_picture
 from measure.fiducials.interior_orientation import AFFINITY_SIGMA
 from measure.fiducials.measure_frame import (
     CHECKED,
@@ -55,7 +55,7 @@ from measure.flags import (
     Code,
     Reason,
 )
-from measure.geometry import fit_similarity, reduced_px, scan_px
+from measure.geometry import reduced_px, scan_px
 from measure.marks.shapes import FiducialLayout
 from measure.scans.scan import Scan
 from measure.tone.curve import Tone
@@ -474,17 +474,13 @@ def _what_to_do(found: StageResult) -> str:
 def false_frames(result: SearchResult, frame: Frame, indices: Iterable[int]) -> float:
     """Expected number of false frames as good in the scan as one with marks, by index, found where they were fitted.
 
-    Null hypothesis: detections are uniform within the search tolerance. A good fit of many marks by a similarity, with
-    or without a stretch, is then improbable. Many places respond as strongly at reduced resolution, but few of them at
-    full resolution: the number is multiplied by their share to the power of at most `_MOST_COUNTED` marks.
+    Null hypothesis: detections are uniform within the search tolerance. Many places respond as strongly at reduced
+    resolution, but few of them at full resolution: the number is multiplied by their share to the power of at most
+    `_MOST_COUNTED` marks.
     """
     placement, found_px = frame.placement, {index: frame.inlier_fits[index].center_px for index in indices}
-    widest_px, expected = result.searches[placement.pitch_mm].tolerance_px, list[float]()
-    for stretches in (np.zeros(1), _STRETCHES):
-        misfit_px = _misfit_px(frame, found_px, stretches)
-        tolerance_px = min(max(misfit_px, NARROW * widest_px), widest_px)
-        expected.append(len(stretches) * false_alarms(result, placement, found_px, frame.inside_count, tolerance_px))
-    at_reduced = _CRITERIA * min(expected)
+    widest_px = result.searches[placement.pitch_mm].tolerance_px
+    at_reduced = false_alarms(result, placement, found_px, frame.inside_count, widest_px)
     if placement.reduction == 1 or not _RARE_FRAMES < at_reduced < _FREQUENT_FRAMES:
         return at_reduced
     return at_reduced * _share_at_full_resolution(result, frame, found_px) ** min(_MOST_COUNTED, len(found_px))
@@ -507,21 +503,6 @@ def _share_at_full_resolution(result: SearchResult, frame: Frame, found_px: Mapp
     weakest, radius_px = min(heights.values()), REDUCED_PX * frame.placement.reduction
     hits = sum(frame.peak(index, place, radius_px, blur_px).height >= weakest for index, place in others)
     return share_of_places(hits, len(others))
-
-
-def _misfit_px(frame: Frame, found_px: Mapping[int, Array], stretches: Array) -> float:
-    """Largest residual, px of the reduced scan, of the marks found after a similarity with the best stretch."""
-    if len(found_px) < 2:
-        return 0.0
-    placement, pitch = frame.placement, frame.pitch_mm
-    given = frame.camera_mm[list(found_px)] @ placement.pixel_from_camera[:, :2].T
-    found = np.array([*found_px.values()])
-    found = found if placement.lens is None else placement.lens.ideal_px(found)
-    longer = np.stack([1 + stretches / 2, 1 - stretches / 2], axis=-1)
-    places, found_mm = (given * pitch * longer[:, None]) @ (1, 1j), (found * pitch) @ (1, 1j)
-    scales, shifts = fit_similarity(places, found_mm, np.ones(len(found)))
-    off = np.abs(found_mm - scales[:, None] * places - shifts[:, None]).max(axis=1)
-    return float(off.min() / pitch.mean() / placement.reduction)
 
 
 def doubt_frame(result: SearchResult, frame: Frame) -> Reason:
