@@ -117,7 +117,7 @@ class ImageEquations:
 
 @dataclass(frozen=True)
 class Displacement:
-    """Distortion of n points: observed minus ideal place."""
+    """Distortion of n points: observed minus ideal place, of a fisheye at c times the angle off the axis."""
 
     value_um: Array  # (n, 2) distortion in µm; nan where the point has no ray
     # (n, 2, 1 + k) derivatives with respect to c and the parameters; 0 where the point has no ray
@@ -238,8 +238,10 @@ class Lens:
             sides = determinant(at.xy_jacobian), determinant(at.imaged.ray_jacobian)
         return ~(found & _is_unfolded(sides[0]) & _is_unfolded(sides[1]))
 
-    def displacement(self, from_principal_point_mm: Array) -> Displacement:
+    def displacement(self, from_principal_point_mm: Array, of_pinhole: bool = False) -> Displacement:
         """Compute the distortion at observed points (n, 2) in mm relative to the principal point.
+
+        of_pinhole: against a pinhole camera also for a fisheye, whose family corrects the equidistant projection.
 
         Notes
         -----
@@ -251,10 +253,22 @@ class Lens:
         ideal_mm[~imaged] = principal_point
         ray = (ideal_mm - principal_point) / c
         at = self.equations(xy_mm, ray)
-        derivatives = c * np.linalg.solve(at.ray_jacobian, np.delete(at.quantity_jacobian, [1, 2], axis=2))
-        derivatives[:, :, 0] -= ray
+        place, by_ray = ray, np.eye(2)
+        if not (of_pinhole or family(self.distortion.family).is_pinhole_at_zero):
+            place, by_ray = _equidistant(ray)
+        derivatives = c * by_ray @ np.linalg.solve(at.ray_jacobian, np.delete(at.quantity_jacobian, [1, 2], axis=2))
+        derivatives[:, :, 0] -= place
         derivatives[~imaged] = 0.0
-        return Displacement(np.where(imaged[:, None], 1e3 * (xy_mm - ideal_mm), np.nan), 1e3 * derivatives, imaged)
+        value_um = 1e3 * (from_principal_point_mm - c * place)
+        return Displacement(np.where(imaged[:, None], value_um, np.nan), 1e3 * derivatives, imaged)
+
+
+def _equidistant(ray: Array) -> tuple[Array, Array]:
+    """Places (n, 2) of rays at their angle off the axis, and derivatives (n, 2, 2)."""
+    square = np.maximum((ray**2).sum(axis=1), 1e-12)
+    factor = np.arctan(np.sqrt(square)) / np.sqrt(square)
+    outward = ray[:, :, None] * ray[:, None, :] * ((1.0 / (1.0 + square) - factor) / square)[:, None, None]
+    return factor[:, None] * ray, factor[:, None, None] * np.eye(2) + outward
 
 
 def _is_unfolded(side: Array) -> Mask:

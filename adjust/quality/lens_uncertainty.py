@@ -41,7 +41,7 @@ RANK = 1e-9  # relative eigenvalue of the scaled normal matrix of an orientation
 
 @dataclass(frozen=True)
 class Curves:
-    """Distortion, in µm, over the radius (n,), in mm.
+    """Distortion, in µm, over the radius (n,), in mm; of a fisheye against the equidistant projection.
 
     radial: outward displacement, mean over all directions; asymmetric: largest displacement over all directions after
     removal of the radial part (decentering and affinity); each with its standard deviation.
@@ -75,11 +75,11 @@ def distortion_curves(lens: Lens, largest_radius_mm: float) -> Curves:
     return Curves(radius, radial, function_sigmas(lens, radial_by), largest, function_sigmas(lens, by_largest))
 
 
-def radial_part(lens: Lens, radius_mm: Array) -> tuple[Array, Array, Array, Array]:
+def radial_part(lens: Lens, radius_mm: Array, of_pinhole: bool = False) -> tuple[Array, Array, Array, Array]:
     """Mean outward displacement (r,), µm, at radii and its derivatives (r, 1 + k) by c and the parameters; remaining
-    displacement (r, DIRECTIONS, 2) and its derivatives."""
+    displacement (r, DIRECTIONS, 2) and its derivatives. of_pinhole: as `Lens.displacement` has it."""
     outward = directions()
-    moved = lens.displacement((radius_mm[:, None, None] * outward).reshape(-1, 2))
+    moved = lens.displacement((radius_mm[:, None, None] * outward).reshape(-1, 2), of_pinhole)
     value = moved.value_um.reshape(len(radius_mm), DIRECTIONS, 2)
     by = moved.by_unknowns_um.reshape(len(radius_mm), DIRECTIONS, 2, -1)
     radial = np.einsum("rdi,di->r", value, outward) / DIRECTIONS

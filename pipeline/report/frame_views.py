@@ -181,10 +181,14 @@ class FrameView:
     stored: ImageRecord | None
 
     @property
+    def is_lost(self) -> bool:
+        """Whether none of its marks is observed."""
+        return not any(mark.status.is_observation for mark in self.frame.marks)
+
+    @property
     def badness(self) -> tuple[bool, float, int]:
         """Sort key, larger is worse: no mark observed, then residuals, then number of open marks."""
-        is_lost = not any(mark.status.is_observation for mark in self.frame.marks)
-        return is_lost, math.hypot(*(self.rms or (0.0,))), sum(mark.needs_review for mark in self.frame.marks)
+        return self.is_lost, math.hypot(*(self.rms or (0.0,))), sum(mark.needs_review for mark in self.frame.marks)
 
 
 def frame_views(data: ReportData, shots: list[ReportedFrame], every_mark: bool = False) -> list[FrameView]:

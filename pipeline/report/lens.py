@@ -37,6 +37,7 @@ _NEAR_AXIS = 1e-3  # fraction of the largest radius within which the distortion 
 
 MAP_GRID = 15  # vectors along the longer side
 LONGEST = 1.5  # longest vector, in grid spacings
+MOST_EXTRAPOLATED = 3.0  # of the distortion up to the outermost target, above and below it, that the curves show
 ARCS = 180  # line segments of the circle around the observed area
 
 
@@ -108,7 +109,7 @@ def certificate(lens: Lens, largest_radius_mm: float) -> CertificateTable:
     """
     radius = np.linspace(0.0, largest_radius_mm, _CERTIFICATE_RADII)[1:]
     radius = np.concatenate([[_NEAR_AXIS * largest_radius_mm], radius])
-    radial_um, radial_by, *_ = radial_part(lens, radius)
+    radial_um, radial_by, *_ = radial_part(lens, radius, of_pinhole=True)
     c = float(lens.interior[0])
     tangent = (radius - radial_um / 1e3) / c
     by = -radial_by / (1e3 * c)
@@ -181,8 +182,12 @@ def curves_plot(drawn: Curves, observed_radius_mm: float, unit: ImageUnit = FILM
         pairs = {"second": (drawn.asymmetric_um, drawn.asymmetric_sigma_um), **pairs}
     curve_of = {kind: (unit.per_um * value, unit.per_um * sigma) for kind, (value, sigma) in pairs.items()}
     radius = unit.per_mm * drawn.radius_mm
-    low = min(0.0, *(float((value - BAND * sigma).min()) for value, sigma in curve_of.values()))
-    high = max(0.0, *(float((value + BAND * sigma).max()) for value, sigma in curve_of.values()))
+    shown = drawn.radius_mm <= max(observed_radius_mm, drawn.radius_mm[0])
+    shown = shown if observed_radius_mm else np.full(len(radius), True)
+    edges = np.array([value + side * BAND * sigma for value, sigma in curve_of.values() for side in (-1.0, 1.0)])
+    low, high = min(0.0, edges[:, shown].min()), max(0.0, edges[:, shown].max())
+    more = MOST_EXTRAPOLATED * (high - low)  # of what grows beyond the targets
+    low, high = max(low - more, min(low, edges.min())), min(high + more, max(high, edges.max()))
     room = 0.06 * max(high - low, 1e-3)
     axes = svg.Axes((0.0, float(radius[-1])), (low - room, high + room), width=400.0, height=300.0)
     x = axes.x(radius)
@@ -197,7 +202,8 @@ def curves_plot(drawn: Curves, observed_radius_mm: float, unit: ImageUnit = FILM
     content.append(labels)
     for kind, (value, sigma) in curve_of.items():
         for half in (BAND * sigma, sigma) if kind == "first" else (BAND * sigma,):
-            edge = np.concatenate([axes.y(value + half), axes.y(value - half)[::-1]])
+            edge = axes.y(np.clip(np.concatenate([value + half, (value - half)[::-1]]), *axes.y_range))
             content.append(svg.line(np.concatenate([x, x[::-1]]), edge, f"band {kind}", closed=True))
-        content.append(svg.line(x, axes.y(value), f"curve {kind}"))
+        inside = np.logical_and.accumulate((value >= axes.y_range[0]) & (value <= axes.y_range[1]))
+        content.append(svg.line(x[inside], axes.y(value[inside]), f"curve {kind}"))
     return svg.picture(axes.width, axes.height, "Distortion over the radius with its 95 % band", *content)

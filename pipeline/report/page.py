@@ -12,7 +12,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from measure import flags
+from measure import Status, flags
 from pipeline.archive.verdicts import scan_counts
 from pipeline.drawing import svg
 from pipeline.report import frame_problems
@@ -142,6 +142,13 @@ def _frame_context(data: ReportData, shots: list[ReportedFrame], every_mark: boo
     """Frames and their marks for the templates."""
     views = frame_views(data, shots, every_mark)
     cards = [card for view in views for card in view.cards if card.needs_review]  # of the worst frame first
+    found = {view.frame.image for view in views if not view.is_lost}
+    # A frame that was not found is one problem, and of a board's points many may lie outside a picture.
+    cards = [
+        card
+        for card in cards
+        if card.mark.status is not Status.ABSENT or (card.mark.is_fiducial and card.mark.image in found)
+    ]
     marks = [mark for frame in shots for mark in frame.marks]
     has_fiducials = any(mark.is_fiducial for mark in marks)
     kinds = {mark.kind for mark in marks if not mark.is_fiducial}

@@ -634,3 +634,23 @@ def test_a_contradiction_is_reported_next_to_what_the_marks_show() -> None:
     assert longer.direction[0] == c
     assert longer.difference[c] == pytest.approx(same.difference[c] - 0.3, abs=0.01)
     assert longer.difference[x0] == pytest.approx(same.difference[x0], abs=0.2 * same.sigma[x0])
+
+
+def test_a_fisheye_is_displaced_from_the_equidistant_projection() -> None:
+    """By Kannala and Brandt's polynomial of the angle, out to 85 degrees; its derivatives by differences."""
+    k, c = np.array([0.05, -0.01, 0.004, -0.001]), 4.0
+    angle = np.radians([1.0, 30.0, 60.0, 85.0])
+    xy = np.outer(c * angle * (1.0 + np.vander(angle**2, 5, increasing=True)[:, 1:] @ k), [0.6, -0.8])
+    lens = Lens(Distortion("opencv_fisheye"), np.array([c, 0.0, 0.0]), np.append(k, [0.0, 0.0]))
+    found = lens.displacement(xy)
+    np.testing.assert_allclose(found.value_um, xy * 1e3 - np.outer(1e3 * c * angle, [0.6, -0.8]), atol=1e-6)
+    for number in range(5):
+        step = 1e-6 * np.eye(7)[number]
+        near = [
+            Lens(lens.distortion, lens.interior + sign * step[0] * np.eye(3)[0], lens.parameters + sign * step[1:])
+            for sign in (1.0, -1.0)
+        ]
+        by = np.subtract(*(each.displacement(xy).value_um for each in near)) / 2e-6
+        np.testing.assert_allclose(found.by_unknowns_um[..., number], by, rtol=1e-5, atol=1e-4)
+    pinhole_um = lens.displacement(xy, of_pinhole=True).value_um
+    np.testing.assert_allclose(pinhole_um, 1e3 * (xy - np.outer(c * np.tan(angle), [0.6, -0.8])), atol=1e-6)

@@ -521,6 +521,22 @@ def test_what_a_frame_lacks_is_reported_once(measured_data: ReportData) -> None:
     assert judge(set_mark(measured_data, -1, Status.ABSENT, "Outside the scan.")).level == "good"
 
 
+def test_what_was_not_found_fills_no_page(measured_data: ReportData) -> None:
+    """A target that is absent has no card among the doubtful marks, nor a fiducial of a frame that was not found."""
+
+    def cards(*kinds: str) -> int:
+        data = measured_data
+        for kind in kinds:
+            data = lose(data, kind, "Nothing there.")
+        first, _ = render_report(data).split('<details id="marks"', 1)
+        return len(re.findall(r'class="card(?: suspect)?"', first))
+
+    of_f2 = [row for row in measured_data.comparator if row.image == "f2" and row.kind == "fiducial"]
+    assert cards("fiducial") == cards() + len(of_f2)
+    assert cards("target") == cards()
+    assert cards("target", "fiducial") == cards()
+
+
 def test_weights_that_the_adjustment_changed_are_noted(adjusted_data: ReportData) -> None:
     rows = [*present(adjusted_data.adjustment).residuals]
     rows[5] = replace(rows[5], weight=0.25)

@@ -16,7 +16,7 @@ from projects import Refusal, command, present, write_network_project
 from adjust import Parameter, adjust, approximate
 from adjust.display import CELLS
 from adjust.functional_model.lens import Lens
-from adjust.quality.lens_uncertainty import distortion_curves
+from adjust.quality.lens_uncertainty import Curves, distortion_curves
 from measure.flags import NO_REASON, Status
 from pipeline import InputError, build_network, read_comparator, read_project
 from pipeline.drawing.svg import round_step, ticks
@@ -211,6 +211,17 @@ def test_the_map_shows_the_longest_vector_and_what_lies_beyond_the_targets() -> 
     curves = distortion_curves(third_degree_lens(), RADIUS_MM)
     assert "no targets here" in curves_plot(curves, 100.0)
     assert "no targets here" not in curves_plot(curves, RADIUS_MM)
+
+
+def test_what_grows_beyond_the_targets_leaves_the_observed_curve_legible() -> None:
+    """Within 40 mm 8 µm and less, at the corner 1000: the axis ends at four times 8.2, the curve where it leaves it."""
+    radius, none = np.linspace(1.0, 100.0, 100), np.zeros(100)
+    value = np.where(radius <= 40.0, 0.2 * radius, 8.0 * np.exp((radius - 40.0) / 12.4))
+    drawn = curves_plot(Curves(radius, value, 0.01 * value, none, none), 40.0)
+    ticks = re.findall(r'<text x="55.00"[^>]*>([^<]*)<', drawn)
+    assert ticks == ["0", "5", "10", "15", "20", "25", "30"]
+    path = re.findall(r'd="M([^"]*)" class="curve first"', drawn)[0]
+    assert path.count("L") == 57  # 58 radii up to 58 mm, where 8 exp(1.45) = 34
 
 
 def test_parameters_say_what_is_significant_carried_by_a_prior_or_correlated() -> None:
