@@ -221,7 +221,7 @@ WIDER = "Targets out to the corners of the frame would tell them apart, in a wid
 OUTWARD = "Targets from the centre to the corners of the frame would tell them apart."
 APART, TILTED = "apart", "tilted"  # remedies that depend on whether the field is known
 CAUSES = {  # of correlations between two kinds of parameters, and the remedy
-    frozenset(("c", "along")): ("flying height and principal distance are correlated", TILTED),
+    frozenset(("c", "along")): ("the distance of the object and the principal distance are correlated", TILTED),
     frozenset(("point", "across")): ("the principal point and a shift of the camera are correlated", APART),
     frozenset(("point", "tilt")): (
         "the principal point and a tilt of the camera are correlated in a narrow field of view",

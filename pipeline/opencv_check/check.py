@@ -336,7 +336,7 @@ def _compare(
     verdict, reason = _verdict(solutions, adjustment)
     if not is_digital:  # whose pixels may have no size
         reason += f" The residuals are {opencv.rms_um:.2f} µm rms a point in OpenCV, {rms_um:.2f} µm here."
-    return verdict, f"{reason} {_notes(solutions)}"
+    return verdict, f"{reason} {_notes(solutions, is_digital)}"
 
 
 def _opencv_solution(images: Sequence[OpenCVPoints], calibrated: Calibrate) -> OpenCvCalibration:
@@ -477,12 +477,12 @@ def _judge_departure(reason: str, adjustment: Adjustment, solutions: _Solutions)
     return "agrees", reason
 
 
-def _notes(solutions: _Solutions) -> str:
+def _notes(solutions: _Solutions, is_digital: bool) -> str:
     """Notes on the simplifications of the bare problem."""
     problem, opencv = solutions.problem, solutions.opencv
     notes = [
-        "This checks the adjustment and not the marks: OpenCV is given the same observations. Both take film "
-        "transformations and object points as known, so these sigmas hold for that case"
+        "This checks the adjustment and not the marks: OpenCV is given the same observations. Both take "
+        f"{'' if is_digital else 'film transformations and '}object points as known, so these sigmas hold for that case"
     ]
     if not solutions.has_residuals:
         notes.append(

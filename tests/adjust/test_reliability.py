@@ -398,7 +398,7 @@ def test_flying_height_and_principal_distance_are_reported() -> None:
     first = result.correlations[0]
     assert [each.text for each in first.parameters] == ["IO.K.c", "EO.*.Z0"]
     assert "c of camera K and Z0 of all images are correlated by" in first.cause
-    assert "flying height and principal distance are correlated" in first.cause
+    assert "the distance of the object and the principal distance are correlated" in first.cause
     assert "tilted in different directions" in first.remedy
     rho = []
     for i in range(4):

@@ -88,6 +88,7 @@ def test_a_moderate_lens_agrees_to_a_tenth_of_a_sigma(distortion: Distortion, as
         assert row.reseau.sigma == pytest.approx(row.opencv.sigma, rel=0.03)
     assert {row.name for row in check.rows} >= {"fx", "cx", "cy", "k1", "k2", "p1", "p2"}
     assert ("fy" in {row.name for row in check.rows}) == (aspect != 1.0)
+    assert ("film transformations" in check.reason) == film
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e3])
