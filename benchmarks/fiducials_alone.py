@@ -74,16 +74,16 @@ def _derived(result: Adjustment, truth: DrawnFrames) -> Iterator[Figure]:
     names = [f"FID.{FILM_CAMERA}.{id_}.{axis}" for id_ in fiducials for axis in "xy"]
     places = np.array([result.value(name) for name in names]).reshape(-1, 2)
     given = np.array([(mark.x_mm.value, mark.y_mm.value) for mark in fiducials.values()])
-    films = [adjusted_image(result, image.name).film for image in result.network.images]
-    found, true = corrections_to_given(films, places, given), corrections_to_given(truth.films, truth.places_mm, given)
+    own = adjusted_image(result, result.network.images[0].name).film
+    found, true = corrections_to_given(own, places, given), corrections_to_given(truth.films[0], truth.places_mm, given)
     if found is not None and true is not None:
-        film = [f"T.{result.network.images[0].name}.{name}" for name in film_parameter_names(films[0].transformation)]
-        cofactor = result.cofactor_of([*names, *film][: found.by_unknowns.shape[1]])
+        of_film = (f"T.{result.network.images[0].name}.{name}" for name in film_parameter_names(own.transformation))
+        cofactor = result.cofactor_of([*names, *of_film])
         covariance = found.by_unknowns @ (result.sigma0**2 * cofactor) @ found.by_unknowns.T
         claims = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         for error, claim in zip((found.corrections_mm - true.corrections_mm).ravel(), claims, strict=True):
             yield "corrections", float(error), float(claim)
-    if films[0].transformation == "congruent":
+    if own.transformation == "congruent":
         covariance = result.sigma0**2 * result.cofactor_of(names)
         for i, j in combinations(range(len(places)), 2):
             vector, row = places[i] - places[j], np.zeros(len(names))

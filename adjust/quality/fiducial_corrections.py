@@ -5,13 +5,12 @@ shear. Estimable are the residuals after the film model's own transformation to 
 estimable only for congruent films.
 """
 
-from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from adjust.array_types import Array
-from adjust.functional_model.transformation import Film, film_kind, film_parameter_names, fit_transformation
+from adjust.functional_model.transformation import Film, film_kind, fit_transformation
 
 KEEPS_DISTANCES = ("none", "congruent")
 STEPS = 10  # Gauss-Newton steps at most; models that are linear in their parameters need one
@@ -20,10 +19,10 @@ STILL_MM = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Corrections:
-    """Residuals after the transformation to the given coordinates that all films have in common.
+    """Residuals after the films' transformation to the given coordinates.
 
     corrections_mm (n, 2): estimated minus given, after it. by_unknowns (2n, 2n + k): derivatives by the estimated
-    places and the k parameters of the first film; k is 0 where the transformation does not start from its comparator.
+    places and the k parameters of the film.
     """
 
     transformation: str
@@ -31,50 +30,31 @@ class Corrections:
     by_unknowns: Array
 
 
-def common_transformation(kinds: Collection[str]) -> str:
-    """The transformation that all these film models contain."""
-    for least in (*KEEPS_DISTANCES, *(kinds if len(set(kinds)) == 1 else ())):
-        if least in kinds:
-            return least
-    conformal = [kind for kind in kinds if kind.startswith(("similarity", "conformal"))]
-    if conformal:
-        return "similarity" if len(conformal) < len(kinds) else min(conformal, key=_parameters)
-    polynomial = [kind for kind in kinds if kind.startswith("polynomial")]
-    return min(polynomial, key=_parameters) if len(polynomial) == len(kinds) else "affine"
-
-
-def _parameters(kind: str) -> int:
-    return len(film_parameter_names(kind))
-
-
-def corrections_to_given(films: Sequence[Film], places_mm: Array, given_mm: Array) -> Corrections | None:
-    """Fit the common transformation of the films to the given coordinates; None if it has no redundancy.
+def corrections_to_given(film: Film, places_mm: Array, given_mm: Array) -> Corrections | None:
+    """Fit the transformation of the films to the given coordinates; None if it has no redundancy.
 
     Parameters
     ----------
+    film : of one image; all of a camera are of its kind.
     places_mm, given_mm : (n, 2) estimated and given places of the same marks.
 
     Notes
     -----
-    The transformation starts from the comparator of the first film if that is of the common kind, else from the
-    estimated places. With x the places in the comparator, T the film with the design matrix D, and T* the
-    transformation with the design matrix G that fits the given places best, corrections are T*(x) - given. They change
-    by (I - G (G'G)^-1 G') T*' dx, where dx = T'^-1 (dX - D dp) for changes dX of the places and dp of the film.
+    The transformation starts from the comparator of the film. With x the places there, T the film with the design
+    matrix D, and T* the transformation with the design matrix G that fits the given places best, corrections are
+    T*(x) - given. They change by (I - G (G'G)^-1 G') T*' dx, where dx = T'^-1 (dX - D dp) for changes dX of the places
+    and dp of the film.
     """
-    common = common_transformation([film.transformation for film in films])
-    if 2 * len(places_mm) <= _parameters(common):
+    if 2 * len(places_mm) <= len(film.parameters):
         return None
     count = len(places_mm)
-    source, by_unknowns = places_mm, np.eye(2 * count)
-    if films[0].transformation == common:
-        source, regular = films[0].comparator_from_camera(places_mm)
-        if not regular.all():
-            return None
-        by_places = np.asarray(np.linalg.inv(films[0].gradient(source)), dtype=np.float64)
-        back = _block_product(by_unknowns, by_places)
-        by_unknowns = np.hstack([back, -back @ films[0].design(source).reshape(2 * count, -1)])
-    parameters, mirrored = fit_transformation(common, source, places_mm)  # initial values
-    kind = film_kind(common, mirrored)
+    source, regular = film.comparator_from_camera(places_mm)
+    if not regular.all():
+        return None
+    back = _block_product(np.eye(2 * count), np.asarray(np.linalg.inv(film.gradient(source)), dtype=np.float64))
+    by_unknowns = np.hstack([back, -back @ film.design(source).reshape(2 * count, -1)])
+    parameters, mirrored = fit_transformation(film.transformation, source, places_mm)  # initial values
+    kind = film_kind(film.transformation, mirrored)
     center, half = source.mean(axis=0), np.array(0.5 * np.ptp(source, axis=0).max())
     for _ in range(STEPS):
         design = kind.design(parameters, source, center, half).reshape(2 * count, -1)
@@ -85,7 +65,7 @@ def corrections_to_given(films: Sequence[Film], places_mm: Array, given_mm: Arra
             break
     projector = np.eye(len(design)) - design @ inverse
     by_source = _block_product(projector, kind.gradient(parameters, source))
-    return Corrections(common, kind.apply(parameters, source) - given_mm, by_source @ by_unknowns)
+    return Corrections(film.transformation, kind.apply(parameters, source) - given_mm, by_source @ by_unknowns)
 
 
 def _block_product(matrix: Array, by_place: Array) -> Array:

@@ -115,7 +115,7 @@ def figure_of_films(
 
     Parameters
     ----------
-    films : film transformations by image. The datum transformation then absorbs all that each of them can.
+    films : film transformations by image, of one kind. The datum transformation then absorbs all that they can.
     otherwise : film transformation of the kind of the datum transformation if films is empty.
 
     Notes
@@ -125,7 +125,7 @@ def figure_of_films(
     """
     known = {id: (mark.given_mm, mark.xy_mm) for id, mark in fiducials.items() if mark.given_mm is not None}
     given, estimated = np.array(list(known.values()), dtype=float).reshape(-1, 2, 2).swapaxes(0, 1)
-    left = corrections_to_given(list(films.values()) or [otherwise], estimated, given) if known else None
+    left = corrections_to_given(next(iter(films.values()), otherwise), estimated, given) if known else None
     if left is None:
         return None
     unknowns = [Parameter.fiducial(name, id, axis) for id in known for axis in "xy"]

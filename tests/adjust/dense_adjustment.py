@@ -10,7 +10,7 @@ import numpy as np
 from networks import camera_of_film
 from numpy.typing import NDArray
 
-from adjust import Prior
+from adjust import Adjustment, Prior
 from adjust.functional_model.transformation import film_parameter_names
 from adjust.linear_algebra.factor import Blocks, Factor
 from adjust.problem.network import EXTERIOR_NAMES, Network
@@ -37,8 +37,9 @@ class DenseResult:
     given: list[str]
 
 
-def solve_densely(network: Network, start: dict[str, float], mirrored: frozenset[str]) -> DenseResult:
-    """Iterate from values by name (of free and of fixed quantities) until nothing moves."""
+def solve_densely(network: Network, begun: Adjustment) -> DenseResult:
+    """Iterate from the values of a result, of free and of fixed quantities, until nothing moves."""
+    start, mirrored = dict(zip(begun.names, begun.values.tolist(), strict=True)), begun.mirrored
     priors = _priors(network)
     names = [name for name in start if name not in priors or priors[name].sigma > 0.0]
     rows = range(len(network.observations))

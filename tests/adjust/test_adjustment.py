@@ -241,7 +241,7 @@ def test_variant(case: Callable[[], Variant]) -> None:
     network, start = case()
     result = adjust(network, start)
     assert result.converged
-    dense = solve_densely(network, dict(zip(result.names, result.values.tolist(), strict=True)), result.mirrored)
+    dense = solve_densely(network, result)
     assert result.redundancy == dense.redundancy
     assert result.vpv == pytest.approx(dense.vpv, rel=1e-8)
     cofactor = result.cofactor_of(list(dense.sigmas)).diagonal()

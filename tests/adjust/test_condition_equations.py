@@ -296,7 +296,7 @@ def observed_network(rng: np.random.Generator) -> tuple[Network, Array]:
 def test_observed_orientations_and_distances_as_in_a_dense_adjustment() -> None:
     network, _ = observed_network(np.random.default_rng(1))
     result = adjust(network, approximate(network))
-    dense = solve_densely(network, dict(zip(result.names, result.values.tolist(), strict=True)), frozenset())
+    dense = solve_densely(network, result)
     names, sigmas = list(dense.sigmas), np.array([*dense.sigmas.values()])
     expected = np.array([dense.values[name] for name in names])
     assert np.abs((result.values_of(names) - expected) / sigmas).max() < 1e-5

@@ -247,8 +247,7 @@ def solve_with_held_marks(network: Network, result: Adjustment) -> DenseResult:
         held = (result.sigma(Parameter.fiducial(nets.FILM_CAMERA, id_, axis)) == 0.0 for axis in "xy")
         x, y = (0.0 if is_held else np.inf for is_held in held)
         fiducials[id_] = Fiducial(Prior(mark.x_mm.value, x), Prior(mark.y_mm.value, y))
-    values = dict(zip(result.names, result.values.tolist(), strict=True))
-    return solve_densely(nets.set_camera(network, fiducials=fiducials), values, result.mirrored)
+    return solve_densely(nets.set_camera(network, fiducials=fiducials), result)
 
 
 @pytest.mark.parametrize(("marks", "kind"), [(4, "affine"), (8, "affine"), (4, "similarity"), (8, "similarity")])

@@ -21,7 +21,7 @@ from adjust.functional_model.transformation import Film, film_parameter_names
 from adjust.problem.estimates import GivenGroup, adjusted_image
 from adjust.problem.network import Approximations, Exterior, Network, ObjectPoint
 from adjust.quality.critical_values import Probabilities, robust_weights
-from adjust.quality.fiducial_corrections import common_transformation, corrections_to_given
+from adjust.quality.fiducial_corrections import corrections_to_given
 from adjust.quality.reliability import Reliability
 from adjust.quality.significance import SignificanceTest
 
@@ -287,7 +287,7 @@ def dense_sigmas(network: Network, result: Adjustment) -> list[float]:
 
     of_rows = np.array([factors[kind] for kind in rows.kind])[:, None, None]
     weighted = nets.set_observations(nets.map_priors(network, rescale), covariance_mm2=rows.covariance_mm2 * of_rows)
-    dense = solve_densely(weighted, dict(zip(result.names, result.values.tolist(), strict=True)), result.mirrored)
+    dense = solve_densely(weighted, result)
     of_priors = [owners.get(name.split(".")[0], "") for name in dense.given]
     group = np.array([*np.repeat(rows.kind, 2), *of_priors])
     helmert = [[(dense.hidden[np.ix_(group == a, group == b)] ** 2).sum() for b in GROUPS] for a in GROUPS]
@@ -335,10 +335,10 @@ def corrections_covariance(result: Adjustment) -> Array:
     names = [f"FID.{nets.FILM_CAMERA}.{id_}.{axis}" for id_ in fiducials for axis in "xy"]
     places = np.array([result.value(name) for name in names]).reshape(-1, 2)
     given = np.array([(mark.x_mm.value, mark.y_mm.value) for mark in fiducials.values()])
-    films = [adjusted_image(result, image.name).film for image in result.network.images]
-    found = corrections_to_given(films, places, given)
+    film = adjusted_image(result, "f0").film
+    found = corrections_to_given(film, places, given)
     assert found
-    names += [f"T.f0.{name}" for name in film_parameter_names(films[0].transformation)]
+    names += [f"T.f0.{name}" for name in film_parameter_names(film.transformation)]
     return np.asarray(found.by_unknowns @ (result.sigma0**2 * result.cofactor_of(names)) @ found.by_unknowns.T)
 
 
@@ -356,23 +356,6 @@ def test_given_values_that_are_too_good_are_left_out_of_a_whole_network_too() ->
     assert without.sigma("FID.K.1.x") == pytest.approx(whole.sigma("FID.K.1.x") / whole.sigma0, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("kinds", "common"),
-    [
-        (["affine", "affine"], "affine"),
-        (["affine", "congruent"], "congruent"),
-        (["affine", "none"], "none"),
-        (["conformal(3)", "conformal(2)"], "conformal(2)"),
-        (["conformal(3)", "similarity"], "similarity"),
-        (["conformal(3)", "projective"], "similarity"),
-        (["projective", "bilinear"], "affine"),
-        (["polynomial(3)", "polynomial(2)"], "polynomial(2)"),
-    ],
-)
-def test_what_films_of_several_kinds_take_up(kinds: list[str], common: str) -> None:
-    assert common_transformation(kinds) == common
-
-
 def test_corrections_are_the_residuals_of_a_least_squares_fit() -> None:
     """By hand, of places that an affine film has moved by a tenth of a degree and 1 mm."""
     rng = np.random.default_rng(5)
@@ -382,10 +365,10 @@ def test_corrections_are_the_residuals_of_a_least_squares_fit() -> None:
     left = design @ np.linalg.lstsq(design, given)[0] - given
     moved = true @ np.array([[1.001, 0.02], [-0.03, 0.999]]) + 1.0
     film = Film("affine", np.array([3.0, -1.0, 0.01, 2.0, 0.02, 1.0]), np.zeros(2))
-    found = corrections_to_given([film], moved, given)
+    found = corrections_to_given(film, moved, given)
     assert found
     np.testing.assert_allclose(found.corrections_mm, left, atol=1e-9)
-    assert corrections_to_given([film], moved[:3], given[:3]) is None
+    assert corrections_to_given(film, moved[:3], given[:3]) is None
 
 
 LOW_RELIEF = nets.Setup(nets.vertical(0.0, 0.0, 0.0, 0.0), relief=20.0, prior=1.0)
