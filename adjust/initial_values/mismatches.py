@@ -20,7 +20,7 @@ APART = 5.0  # times the usual miss from which a ray is doubted
 GROSS = 20.0  # standard deviations below which residuals tell what is wrong
 MOST_PAIRS = 100  # pairs of rays of a point whose intersections are tried
 FEWEST = 2  # rays that meet
-USUAL = 0.75  # share of points, and of an image's rays, of which the largest miss is usual
+USUAL = 0.75  # share of points of which the largest miss is usual
 
 
 @dataclass(frozen=True)
@@ -94,9 +94,7 @@ def find_mismatches(problem: Problem) -> Mismatches:
     missed = rays.misses_mm(rows, unknowns.start[problem.places[rows]])
     _, of_point = np.unique(problem.places[rows, 0], return_inverse=True)
     largest = _largest(missed, of_point)
-    usual = np.full(len(largest), max(float(np.quantile(largest, USUAL)), GROSS / APART * rays.sigma_mm))
-    if np.any(largest > APART * usual):
-        usual = np.maximum(usual, _largest(_usual_misses(missed, problem.image_numbers[rows]), of_point))
+    usual = max(float(np.quantile(largest, USUAL)), GROSS / APART * rays.sigma_mm)
     for number in np.flatnonzero(largest > APART * usual):
         own = rows[of_point == number]
         # Intersections of pairs of the point's rays, and its start; known coordinates are kept.
@@ -106,7 +104,7 @@ def find_mismatches(problem: Problem) -> Mismatches:
         both, of_pair = pairs.ravel(), np.repeat(np.arange(len(pairs)), 2)
         met, _ = intersect(rays.centers[both], rays.directions[both], of_pair, np.tile(known, (len(pairs), 1)))
         met = np.concatenate([unknowns.start[at][None], met[~np.isnan(met).any(axis=1)]])
-        meets = (missed := rays.misses_mm(own, met[:, None])) <= APART * usual[number]
+        meets = (missed := rays.misses_mm(own, met[:, None])) <= APART * usual
         best = int(np.lexsort((np.where(meets, missed, 0.0).sum(axis=1), -meets.sum(axis=1)))[0])
         name = problem.network.observations.point[own[0]]
         places[name] = met[best]
@@ -124,11 +122,3 @@ def _largest(values: Array, group: Indices) -> Array:
     largest = np.zeros(group.max() + 1)
     np.maximum.at(largest, group, values)
     return largest
-
-
-def _usual_misses(missed: Array, images: Indices) -> Array:
-    """(n,) miss that most rays of each ray's image keep: large where the orientation is wrong; 0 for a single ray."""
-    order = np.lexsort((missed, images))
-    starts, counts = np.unique(images[order], return_index=True, return_counts=True)[1:]
-    usual = np.where(counts > 1, missed[order][starts + (USUAL * (counts - 1)).astype(np.intp)], 0.0)
-    return np.asarray(usual[np.searchsorted(images[order][starts], images)])
