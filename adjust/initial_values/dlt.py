@@ -33,9 +33,9 @@ class _Normalised:
 
     @classmethod
     def normalise(cls, places: Array, present: Mask) -> "_Normalised":
-        is_there = present[..., None]
-        origin = (places * is_there).sum(axis=1) / present.sum(axis=1)[:, None]
-        centred = (places - origin[:, None]) * is_there
+        weights = present.astype(np.float64)
+        origin = (weights[:, None] @ places)[:, 0] / weights.sum(axis=1)[:, None]
+        centred = (places - origin[:, None]) * weights[..., None]
         largest = _size_or_one(np.abs(centred).max(axis=(1, 2)))  # for the squares
         centred /= largest[:, None, None]
         squares, axes = np.linalg.eigh(centred.swapaxes(1, 2) @ centred)

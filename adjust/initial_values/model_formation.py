@@ -315,7 +315,7 @@ def intersect_points(block: BlockState, weakest: float) -> dict[str, Array]:
     position = {name: i for i, name in enumerate(names)}
     rows = [
         (image, k, position[name])
-        for image in sorted(block.poses)
+        for image in (sorted(block.poses) if names else ())
         for k, name in enumerate(block.sights[image].points)
         if name in position
     ]

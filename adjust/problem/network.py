@@ -279,6 +279,27 @@ class Network:
         values, sigmas = np.array(pairs).reshape(-1, 3, 2).transpose(2, 0, 1)
         return values, sigmas
 
+    @cached_property
+    def round_origin(self) -> Array:
+        """Round origin (3,) near the centre of the given coordinates; zero where the field includes the origin.
+
+        It is a multiple of a power of two near the field's extent, so that no digit of a reduced coordinate is lost.
+        Heights are not reduced where the line of sight depends on them. Where no point is given, stations count.
+        """
+        xyz, _ = self.point_priors
+        if np.isnan(xyz).all():
+            stations = [image.exterior.center for image in self.images if image.exterior is not None]
+            xyz = np.array(stations).reshape(-1, 3)
+        given = [axis[~np.isnan(axis)] for axis in xyz.T]
+        middle = np.array([np.median(axis) if len(axis) else 0.0 for axis in given])
+        off = [np.abs(axis - center) for axis, center in zip(given, middle, strict=True) if len(axis)]
+        extent = max((float(np.median(axis)) for axis in off), default=0.0)
+        step = 2.0 ** np.ceil(np.log2(4.0 * extent)) if extent > 0.0 else 1.0
+        origin = step * np.round(middle / step)
+        if not self.line_of_sight.is_straight:
+            origin[2] = 0.0
+        return origin if np.isfinite(origin).all() else np.zeros(3)
+
     def coordinates(self, firm: bool) -> dict[str, Array]:
         """(3,) known coordinates of every point, nan where unknown; firm: without approximations (infinite sigma)."""
         values, sigmas = self.point_priors

@@ -238,24 +238,8 @@ class Reduction:
 
     @classmethod
     def to_centroid(cls, network: Network) -> "Reduction":
-        """Choose a round origin near the centre of the given coordinates; zero where the field includes the origin.
-
-        The origin is a multiple of a power of two near the field's extent, so that no digit of a coordinate is lost.
-        Heights are not reduced where the line of sight depends on them. Where no point is given, stations count.
-        """
-        xyz, _ = network.point_priors
-        if np.isnan(xyz).all():
-            stations = [image.exterior.center for image in network.images if image.exterior is not None]
-            xyz = np.array(stations).reshape(-1, 3)
-        given = [axis[~np.isnan(axis)] for axis in xyz.T]
-        middle = np.array([np.median(axis) if len(axis) else 0.0 for axis in given])
-        off = [np.abs(axis - center) for axis, center in zip(given, middle, strict=True) if len(axis)]
-        extent = max((float(np.median(axis)) for axis in off), default=0.0)
-        step = 2.0 ** np.ceil(np.log2(4.0 * extent)) if extent > 0.0 else 1.0
-        origin = step * np.round(middle / step)
-        if not network.line_of_sight.is_straight:
-            origin[2] = 0.0
-        return cls(origin if np.isfinite(origin).all() else np.zeros(3))
+        """Reduce a network to its round origin."""
+        return cls(network.round_origin)
 
     @property
     def is_none(self) -> bool:

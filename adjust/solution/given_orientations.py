@@ -137,19 +137,20 @@ def orientations_elsewhere(network: Network, result: Adjustment, is_observed: bo
     """
     if result.termination == "singular" or not network.observed_points:
         return ""
+    is_open = len(network.known_places) < 2  # in scale, rotation and position
     plan = {
         point.id: np.array([point.X.value, point.Y.value])
         for point in network.points
-        if point.X and point.Y and point.id in result.network.observed_points
+        if is_open and point.X and point.Y and point.id in result.network.observed_points
     }
-    if plan and (words := _other_unit(network, adjusted_places(result, list(plan))[:, :2], np.array([*plan.values()]))):
+    if plan and (words := _other_unit(adjusted_places(result, list(plan))[:, :2], np.array([*plan.values()]))):
         return words.replace("stations or distances", "approximate X and Y")
     given = given_stations(network)
     if len(given) < 2:
         return ""
     compared = _Compared.from_result(network, result, given)
     return (
-        _other_unit(network, compared.stations, compared.places)
+        (_other_unit(compared.stations, compared.places) if is_open else "")
         or _misread_table(compared, is_observed)
         or _mirrored_points(compared, _points(result))
     )
@@ -213,10 +214,10 @@ def _mirrored_points(compared: _Compared, points: Array) -> str:
     return ""
 
 
-def _other_unit(network: Network, found: Array, given: Array) -> str:
+def _other_unit(found: Array, given: Array) -> str:
     """Describe another unit of points that leave the datum in plan open, by other places (n, k); empty if none."""
     spreads = [float(np.linalg.norm(each - each.mean(axis=0))) for each in (found, given)]
-    if len(network.known_places) > 1 or not all(spreads) or procrustes(given, found)[2] > NEAR**2:
+    if not all(spreads) or procrustes(given, found)[2] > NEAR**2:
         return ""
     words = (UNIT.format(times_too(f)) for f in FACTORS if abs(np.log(f * spreads[0] / spreads[1])) < NEAR)
     remedy = "Give both in the unit that [object] unit names."

@@ -166,8 +166,10 @@ def _jumps(rows: Single) -> Array:
     """(n - 1,) how much better each row continues the one before after a shift by a pixel one way than the other, in
     standard deviations."""
     ahead, behind = (np.abs(rows[1:, side] - rows[:-1, 1:-1]) for side in (slice(2, None), slice(-2)))
-    better = (behind - ahead) / np.maximum(behind + ahead, np.finfo(np.float32).tiny)
-    return _standardised(better.mean(axis=1, dtype=float))
+    both = behind + ahead
+    behind -= ahead
+    behind /= np.maximum(both, np.finfo(np.float32).tiny, out=both)
+    return _standardised(behind @ np.full(behind.shape[1], 1.0 / behind.shape[1], dtype=np.float32))
 
 
 def _roughness(rows: Single, order: int, around: int = _AROUND, most: float = np.inf) -> Array:
