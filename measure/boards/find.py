@@ -342,11 +342,22 @@ def _grids(picture: Bytes, spec: ChessboardSpec) -> Iterator[tuple[Array, float]
 
 
 def _chessboard_of_any_count(picture: Bytes) -> Array | None:
-    """(rows, columns, 2) largest chessboard found by OpenCV's newer detector."""
-    cv2.setRNGSeed(1)
-    flags = _THOROUGHLY | cv2.CALIB_CB_LARGER
-    found, corners, meta = cv2.findChessboardCornersSBWithMeta(picture, (_LEAST, _LEAST), flags)
-    return np.asarray(corners, float).reshape(*meta.shape, 2) if found else None
+    """(rows, columns, 2) largest chessboard found by OpenCV's newer detector from two sizes on, since a start may lie
+    off the board. A grid that passes over corners has others in its cells, not the colours of squares."""
+    grids: list[Array] = []
+    for least in (_LEAST, _LEAST + 1):
+        cv2.setRNGSeed(1)
+        flags = _THOROUGHLY | cv2.CALIB_CB_LARGER
+        found, corners, meta = cv2.findChessboardCornersSBWithMeta(picture, (least, least), flags)
+        grids += [np.asarray(corners, float).reshape(*meta.shape, 2)] if found else []
+    squares = [grid for grid in grids if has_squares(picture, grid)]
+    return max(squares, key=np.size, default=None)
+
+
+def has_squares(picture: Bytes, grid: Array) -> bool:
+    """Whether the middles of a grid's cells have the colours seen beside its corners."""
+    beside, middle = (float(np.median(_crossing_contrast(picture, grid, into))) for into in (_INTO_SQUARE, 0.5))
+    return bool(middle * np.sign(beside) > _CROSSING * abs(beside))
 
 
 def _drawn_chessboard_grid(picture: Bytes, spec: ChessboardSpec, flags: int, drawings: int) -> Array | None:

@@ -17,7 +17,7 @@ from studies import parametrize_with_studies
 from measure import Status, open_scan
 from measure.boards import find, specs
 from measure.boards.corner_fit import edge_curvatures
-from measure.boards.find import is_even, recognise_board, whole_pattern
+from measure.boards.find import has_squares, is_even, recognise_board, whole_pattern
 from measure.boards.lattice import grid_of_any_count
 from measure.boards.markers import (
     MarkerReadings,
@@ -608,6 +608,38 @@ def test_recognise_board_names_the_kind_from_the_markers(kind: str) -> None:
     picture[10:210, 10:260], picture[75:125, 270:320] = markers, chessboard
     scan = draw.make_scan(gaussian_filter(picture, 0.6) * 256.0)
     assert recognise_board(scan).startswith(f"--kind {kind} --dictionary 6X6_250")
+
+
+@pytest.mark.parametrize("seed", [0, 47])
+def test_recognise_board_counts_a_chessboard_among_other_things(seed: int) -> None:
+    """Drawn by OpenCV's polygons: rectangles around the board, at which a search from the smallest grid starts."""
+    random = np.random.default_rng(seed)
+    picture = np.full((480, 640), 110.0)
+    ends = np.array([(200, 140), (420, 150), (410, 330), (190, 320)]) + random.uniform(-60, 60, (4, 2))
+    corners = np.array([(0, 0), (9, 0), (9, 7), (0, 7)], np.float32)
+    homography = cv2.getPerspectiveTransform(corners, ends.astype(np.float32))
+
+    def fill(outline: Array, grey: float) -> None:
+        places = cv2.perspectiveTransform(outline[:, None].astype(np.float32), homography)
+        cv2.fillConvexPoly(picture, np.round(places * 16).astype(np.int32), grey, cv2.LINE_AA, 4)
+
+    for _ in range(40):
+        first = random.uniform(0, 600, 2) * (1, 0.75)
+        last, grey = first + random.uniform(10, 60, 2), random.uniform(20, 240)
+        cv2.rectangle(picture, first.astype(int).tolist(), last.astype(int).tolist(), grey, -1)
+    fill(corners + 0.3 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]), 235.0)
+    for place in np.argwhere(np.indices((9, 7)).sum(axis=0) % 2 == 0):
+        fill(place + np.array([(0, 0), (1, 0), (1, 1), (0, 1)]), 25.0)
+    picture = cv2.GaussianBlur(picture, (0, 0), 0.8) + random.normal(0, 3, picture.shape)
+    assert recognise_board(draw.make_scan(np.clip(picture, 0, 255) * 256.0)) == "--board 8x6"
+
+
+@pytest.mark.parametrize("down", [(0, 1), (-1, 2), (0, 3)])
+def test_a_grid_that_passes_over_corners_has_no_squares(down: tuple[int, int]) -> None:
+    """Every place is a corner, and light and dark alternate around all of them."""
+    picture = np.kron(np.indices((16, 16)).sum(axis=0) % 2 * 200 + 20, np.ones((20, 20))).astype(np.uint8)
+    places = np.stack(np.meshgrid(np.arange(5), np.arange(4)), axis=-1) @ np.array([(1, 0), down])
+    assert has_squares(picture, 20.0 * places + (119.5, 39.5)) == (down == (0, 1))
 
 
 def test_a_wrong_side_of_the_markers_is_named_with_the_right_one() -> None:
