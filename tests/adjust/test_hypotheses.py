@@ -186,8 +186,8 @@ def test_an_estimated_noise_does_not_hide_two_cameras_in_one(seed: int) -> None:
 FITTED = replace(SOUND, sigma=0.1)  # standard deviations given ten times too small
 
 
-@parametrize_with_studies("seed", [6, 3, 5, 7])
-@parametrize_with_studies("noise", [1.0, 10.0], quick=(1,))
+@parametrize_with_studies("seed", [3, 6, 5, 7])
+@parametrize_with_studies("noise", [1.0, 10.0])
 def test_each_image_with_a_principal_distance_of_its_own_is_no_two_groups(seed: int, noise: float) -> None:
     made, rng = faults.scene(seed, flat=True), np.random.default_rng(seed)
     zooms = rng.normal(size=len(made.groups))
