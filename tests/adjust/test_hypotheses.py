@@ -1141,7 +1141,7 @@ def test_a_fisheye_in_a_family_that_is_not_for_it_is_named() -> None:
         adjust(nets.set_camera(network, distortion=free))
 
 
-@pytest.mark.parametrize(("order", "words"), [([0, 1], "longitude and latitude"), ([1, 0], "latitude and longitude")])
+@parametrize_with_studies(("order", "words"), [([0, 1], "longitude and latitude"), ([1, 0], "latitude and longitude")])
 def test_points_in_degrees_are_named(order: list[int], words: str) -> None:
     """A degree at 45 degrees of latitude is 78,847 m and 111,132 m long (tables of WGS 84)."""
     field = nets.relief_field(300.0, n=16)

@@ -284,7 +284,7 @@ def test_an_image_with_a_point_behind_its_camera_is_left_out(robust: bool, monke
     """One number of 55 is wrong: its point, in sight of all others, lies behind that one camera."""
     monkeypatch.setitem(globals(), "BOARD", np.vstack([BOARD, [10.0, 5.0, -170.0]]))
     rng = np.random.default_rng(6)
-    images = good_images(8, rng)
+    images = good_images(5, rng)
     near = view_points(np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.0, 120.0]))
     near[-1] = 0.5, 0.3
     result = adjust(make_network({**images, "near": near}, rng), options=Options(robust=robust))

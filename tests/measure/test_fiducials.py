@@ -162,7 +162,10 @@ def test_a_negative_is_measured_as_it_is() -> None:
     result = draw.measure_grey(20000 - draw.frame_picture(draw.NUMBERED, matrix), polarised("light"))
     draw.assert_right(result, draw.NUMBERED, matrix)
     assert "a negative of what the camera file draws" in result.notes[0]
-    positive = draw.measure_grey(draw.frame_picture(draw.NUMBERED, matrix), polarised("light"))
+
+
+def test_a_positive_is_no_negative() -> None:
+    positive = draw.measure_grey(draw.frame_picture(draw.NUMBERED, draw.pixel_from_camera("0")), polarised("light"))
     assert not any("negative" in note for note in positive.notes)
 
 
